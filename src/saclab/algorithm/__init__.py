@@ -1,0 +1,1 @@
+"""The SAC family in pure JAX: no environment, no file, no clock, no hidden state."""

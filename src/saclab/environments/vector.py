@@ -1,0 +1,129 @@
+"""Step several training environments in turn. Truncation and the start of the next episode are solved here, once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saclab.environments.make import environment_spec, make_environment
+from saclab.environments.simulator import capture_state, restore_state
+
+
+class Transitions(NamedTuple):
+    """One step of each environment. N: environments."""
+
+    observation: np.ndarray
+    """f32[N, O]."""
+    action: np.ndarray
+    """f32[N, A] in [-1, 1]."""
+    reward: np.ndarray
+    """f32[N]."""
+    next_observation: np.ndarray
+    """f32[N, O]: what the action led to, also where the episode ended; never the next episode's first one."""
+    terminated: np.ndarray
+    """bool[N]: the episode ended in a terminal state. A time limit (truncation) is not one."""
+
+
+class EndedEpisode(NamedTuple):
+    environment: int
+    total_reward: float
+    length: int
+    terminated: bool
+
+
+class NonFiniteError(RuntimeError):
+    """An environment gave an observation or a reward that is not a finite number."""
+
+
+class TrainingEnvironments:
+    """N environments, each always inside an episode: the one after an end starts at once."""
+
+    def __init__(self, environment: str, arguments: Mapping[str, Any], seeds: list[int]) -> None:
+        """Make one environment per seed and start its first episode."""
+        self.name = environment
+        self.environments = [make_environment(environment, arguments) for _ in seeds]
+        self.spec = environment_spec(environment, self.environments[0])
+        self.observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
+        """f32[N, O]: the current observations."""
+        self.total_rewards = np.zeros(len(seeds), np.float64)
+        self.lengths = np.zeros(len(seeds), np.int64)
+        for index, seed in enumerate(seeds):
+            self._start_episode(index, seed=seed)
+
+    def __len__(self) -> int:
+        return len(self.environments)
+
+    def step(self, action: np.ndarray) -> tuple[Transitions, list[EndedEpisode]]:
+        """Apply f32[N, A] in [-1, 1].
+
+        Raises:
+            NonFiniteError: if an environment gives an observation or a reward that is not finite.
+        """
+        observation = self.observation.copy()
+        reward = np.zeros(len(self), np.float32)
+        next_observation = np.empty_like(observation)
+        terminated = np.zeros(len(self), bool)
+        ended = []
+        scaled = self.spec.scale_action(action)
+        for index, environment in enumerate(self.environments):
+            seen, gained, terminated[index], truncated, _ = environment.step(scaled[index])
+            next_observation[index], reward[index] = seen, gained
+            self._require_finite(index, next_observation[index], float(gained))
+            self.total_rewards[index] += float(gained)
+            self.lengths[index] += 1
+            if terminated[index] or truncated:
+                ended.append(self._ended(index, bool(terminated[index])))
+                self._start_episode(index)
+            else:
+                self.observation[index] = seen
+        return Transitions(observation, action, reward, next_observation, terminated), ended
+
+    def close(self) -> None:
+        for environment in self.environments:
+            environment.close()
+
+    def capture(self) -> list[dict[str, Any] | None]:
+        """The exact state of each environment and its episode so far; None where it cannot be captured."""
+        states: list[dict[str, Any] | None] = []
+        for index, environment in enumerate(self.environments):
+            state = capture_state(environment)
+            if state is not None:
+                state["observation"] = self.observation[index].copy()
+                state["total_reward"] = float(self.total_rewards[index])
+                state["length"] = int(self.lengths[index])
+            states.append(state)
+        return states
+
+    def restore(self, states: list[dict[str, Any] | None]) -> list[int]:
+        """Continue from `capture`. Environments whose state could not be captured start a new episode; returns them."""
+        restarted = []
+        for index, (environment, state) in enumerate(zip(self.environments, states, strict=True)):
+            if state is None:
+                restarted.append(index)
+                continue
+            restore_state(environment, state)
+            self.observation[index] = state["observation"]
+            self.total_rewards[index] = state["total_reward"]
+            self.lengths[index] = state["length"]
+        return restarted
+
+    def _ended(self, index: int, terminated: bool) -> EndedEpisode:
+        return EndedEpisode(index, float(self.total_rewards[index]), int(self.lengths[index]), terminated)
+
+    def _start_episode(self, index: int, seed: int | None = None) -> None:
+        self.observation[index], _ = self.environments[index].reset(seed=seed)
+        self.total_rewards[index], self.lengths[index] = 0.0, 0
+        self._require_finite(index, self.observation[index], 0.0)
+
+    def _require_finite(self, index: int, observation: np.ndarray, reward: float) -> None:
+        if np.isfinite(reward) and np.isfinite(observation).all():
+            return
+        broken = np.flatnonzero(~np.isfinite(observation)).tolist()
+        what = f"observation entries {broken[:10]}" if broken else f"reward {reward}"
+        raise NonFiniteError(
+            f"environment {self.name} number {index} gave a value that is not finite ({what}) in step "
+            f"{int(self.lengths[index]) + 1} of an episode: check the environment, or wrap it so that it ends the "
+            "episode before it diverges"
+        )

@@ -1,0 +1,27 @@
+"""The errors that a user can mend. The command line prints each as one line and exits with status 2."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(ValueError):
+    """Something the user gave cannot work; the message names it and the way out."""
+
+
+class SettingError(UserError):
+    """A setting's value cannot work."""
+
+    def __init__(self, setting: str, value: object, way_out: str) -> None:
+        super().__init__(f"{setting} = {value!r}: {way_out}")
+        self.setting, self.value, self.way_out = setting, value, way_out
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
+    """The error for a name that is not among the known ones; suggests the nearest."""
+    known = sorted(known)
+    nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f"did you mean {nearest[0]!r}? " if nearest else ""
+    listed = ", ".join(known) if len(known) <= 60 else f"{len(known)} of them"
+    return UserError(f"unknown {kind} {name!r}: {hint}known: {listed}")

@@ -1,0 +1,115 @@
+"""The training protocols, each a row of data, and the one place where a run's configuration is put together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names, replace_settings
+from saclab.errors import unknown_name
+from saclab.variants import variant_settings
+
+
+@dataclass(frozen=True)
+class Protocol:
+    description: str
+    settings: TrainingSettings
+    by_environment: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """What differs for environments whose id starts with a key."""
+    algorithm: dict[str, Any] = field(default_factory=dict)
+    """What the protocol changes of the algorithm's settings."""
+
+
+PROTOCOLS: dict[str, Protocol] = {
+    "paper": Protocol(
+        "The paper's experiment: an update every 5 steps, replay of 2e5, a test of 20 episodes every 10 episodes; "
+        "1.2e6 updates, on Humanoid at most 1.5e6 updates or 1e4 episodes or 750 episodes without a better test.",
+        TrainingSettings(
+            random_steps=10_000,
+            update_interval=5,
+            replay_capacity=200_000,
+            max_updates=1_200_000,
+            evaluation_interval_episodes=10,
+            evaluation_episodes=20,
+        ),
+        by_environment={
+            "Humanoid-": {"max_updates": 1_500_000, "max_episodes": 10_000, "patience_episodes": 750},
+        },
+    ),
+    "standard": Protocol(
+        "What most SAC papers report: 1M environment steps, an update each step, replay of 1e6, "
+        "a test of 10 episodes every 10k steps.",
+        TrainingSettings(
+            random_steps=10_000,
+            update_interval=1,
+            replay_capacity=1_000_000,
+            max_steps=1_000_000,
+            evaluation_interval_steps=10_000,
+            evaluation_episodes=10,
+            log_interval=1000,
+        ),
+    ),
+    "quick": Protocol(
+        "Minutes instead of hours, to see every part at work: too short to judge a variant by.",
+        TrainingSettings(
+            random_steps=2_000,
+            update_interval=1,
+            replay_capacity=100_000,
+            max_updates=10_000,
+            evaluation_interval_steps=1_000,
+            evaluation_episodes=5,
+            log_interval=100,
+        ),
+    ),
+}
+
+
+def training_settings(protocol: str, environment: str) -> TrainingSettings:
+    """The settings of a protocol on an environment; raises UserError for an unknown protocol."""
+    if protocol not in PROTOCOLS:
+        raise unknown_name("protocol", protocol, PROTOCOLS)
+    settings = PROTOCOLS[protocol].settings
+    for prefix, changes in PROTOCOLS[protocol].by_environment.items():
+        if environment.startswith(prefix):
+            settings = replace_settings(settings, changes)
+    return settings
+
+
+def make_config(
+    environment: str,
+    variant: str = "sac-auto",
+    protocol: str = "standard",
+    seed: int = 0,
+    environment_arguments: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Config:
+    """The configuration of a run: variant and protocol on an environment, with any setting changed by name.
+
+    Args:
+        environment: Gymnasium id.
+        variant: a key of VARIANTS.
+        protocol: a key of PROTOCOLS.
+        seed: every random draw of the run derives from it.
+        environment_arguments: keyword arguments of the environment.
+        overrides: settings of AlgorithmSettings or TrainingSettings by name, with their values.
+
+    Raises:
+        UserError: for a name that does not exist or a value that cannot work.
+    """
+    training = training_settings(protocol, environment)
+    algorithm = replace_settings(variant_settings(variant, environment), PROTOCOLS[protocol].algorithm)
+    algorithm_names, training_names = field_names(AlgorithmSettings), field_names(TrainingSettings)
+    overrides = dict(overrides or {})
+    for name in overrides:
+        if name not in algorithm_names + training_names:
+            raise unknown_name("setting", name, algorithm_names + training_names)
+    return Config(
+        environment=environment,
+        variant=variant,
+        protocol=protocol,
+        seed=seed,
+        algorithm=replace_settings(algorithm, {k: v for k, v in overrides.items() if k in algorithm_names}),
+        training=replace_settings(training, {k: v for k, v in overrides.items() if k in training_names}),
+        environment_arguments=dict(environment_arguments or {}),
+    )

@@ -1,0 +1,115 @@
+"""A uniform ring buffer of transitions, one packed row each: one gather and one transfer make a batch."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from saclab.algorithm.networks import Array
+from saclab.algorithm.types import Batch
+from saclab.environments.vector import Transitions
+from saclab.errors import SettingError
+
+
+class RowLayout(NamedTuple):
+    """How a transition lies in a row: observation, action, reward, next observation, terminated."""
+
+    observation_size: int
+    action_size: int
+
+    @property
+    def width(self) -> int:
+        """Numbers in a row."""
+        return 2 * self.observation_size + self.action_size + 2
+
+    def pack(self, transitions: Transitions) -> np.ndarray:
+        """f32[N, width]."""
+        columns = (transitions.reward[:, None], transitions.next_observation, transitions.terminated[:, None])
+        rows: np.ndarray = np.concatenate([transitions.observation, transitions.action, *columns], axis=1)
+        return rows.astype(np.float32, copy=False)
+
+    def unpack(self, rows: Array) -> Batch:
+        """A batch from f32[B, width], NumPy or JAX."""
+        action = self.observation_size
+        reward = action + self.action_size
+        terminated = self.width - 1
+        return Batch(
+            observation=rows[:, :action],
+            action=rows[:, action:reward],
+            reward=rows[:, reward],
+            next_observation=rows[:, reward + 1 : terminated],
+            terminated=rows[:, terminated],
+        )
+
+
+class ReplayBuffer:
+    """The last `capacity` transitions."""
+
+    def __init__(self, capacity: int, layout: RowLayout) -> None:
+        """Memory is taken from the system as rows are filled, not before."""
+        self.layout = layout
+        self.rows = np.zeros((capacity, layout.width), np.float32)
+        """f32[capacity, width]; row i holds transition number i, i + capacity, …"""
+        self.added = 0
+        """Transitions added since the start of the run."""
+
+    @property
+    def capacity(self) -> int:
+        return len(self.rows)
+
+    @property
+    def size(self) -> int:
+        """Transitions held."""
+        return min(self.added, self.capacity)
+
+    def add(self, transitions: Transitions) -> None:
+        """Store N transitions in place of the oldest ones."""
+        rows = self.layout.pack(transitions)
+        positions = np.arange(self.added, self.added + len(rows)) % self.capacity
+        self.rows[positions] = rows
+        self.added += len(rows)
+
+    def sample(self, generator: np.random.Generator, batch_size: int) -> np.ndarray:
+        """f32[batch_size, width], each row drawn uniformly and independently."""
+        rows: np.ndarray = self.rows[generator.integers(0, self.size, batch_size)]
+        return rows
+
+
+GIB = 2**30
+
+
+def require_memory(capacity: int, layout: RowLayout, runs_at_once: int = 1) -> None:
+    """Refuse a replay buffer that the machine's free memory cannot hold once it is full."""
+    needed, available = runs_at_once * replay_bytes(capacity, layout), available_memory()
+    if available is not None and needed > available:
+        fits = int(available / needed * capacity * 0.8)
+        together = f" in each of {runs_at_once} runs at once" if runs_at_once > 1 else ""
+        raise SettingError(
+            "replay_capacity", capacity,
+            f"{capacity} transitions of {layout.width} numbers{together} take {needed / GIB:.2f} GiB, and "
+            f"{available / GIB:.2f} GiB are free: use --replay-capacity {fits} or less"
+            + (" or fewer --workers" if runs_at_once > 1 else ""),
+        )  # fmt: skip
+
+
+def replay_bytes(capacity: int, layout: RowLayout) -> int:
+    """Memory of a full buffer."""
+    return capacity * layout.width * np.dtype(np.float32).itemsize
+
+
+def available_memory() -> int | None:
+    """Bytes that a new process can use, as far as the system says: free memory, or less inside a container."""
+    limits = []
+    meminfo = Path("/proc/meminfo")
+    if meminfo.exists():
+        entries = dict(line.split(":") for line in meminfo.read_text().splitlines())
+        limits.append(int(entries["MemAvailable"].split()[0]) * 1024)
+    elif "SC_AVPHYS_PAGES" in os.sysconf_names:
+        limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
+    if limit.exists() and used.exists() and limit.read_text().strip() != "max":
+        limits.append(int(limit.read_text()) - int(used.read_text()))
+    return min(limits, default=None)

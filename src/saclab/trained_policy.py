@@ -1,0 +1,93 @@
+"""A trained policy on disk, and in a user's hands."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+
+from saclab.algorithm.policy import make_policy
+from saclab.config import AlgorithmSettings, Config
+from saclab.environments.make import EnvironmentSpec
+from saclab.errors import UserError
+
+ARRAYS, DESCRIPTION = "policy.safetensors", "policy.json"
+
+
+class TrainedPolicy:
+    """Acts in the environment's own units, on NumPy alone; `predict` has Stable-Baselines3's signature."""
+
+    def __init__(self, settings: AlgorithmSettings, spec: EnvironmentSpec, parameters: np.ndarray, seed: int = 0):
+        self.policy = make_policy(settings, spec.observation_size, spec.action_size)
+        self.spec = spec
+        self.parameters = parameters
+        self.generator = np.random.default_rng(seed)
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """Actions within the environment's bounds, and `state` as it came.
+
+        Args:
+            observation: [O], or [N, O] for a batch.
+            state: unused; a policy without memory has none.
+            episode_start: unused.
+            deterministic: tanh of the mean, or a sample of the policy.
+
+        Raises:
+            UserError: if the observation's size is not the policy's.
+        """
+        observation = np.asarray(observation, np.float32)
+        size = self.spec.observation_size
+        if observation.ndim not in (1, 2) or observation.shape[-1] != size:
+            raise UserError(f"observation has shape {observation.shape}, and this policy takes [{size}] or [N, {size}]")
+        batch = np.atleast_2d(observation)
+        if deterministic:
+            action = self.policy.mode(self.parameters, batch)
+        else:
+            noise = self.generator.standard_normal((len(batch), self.spec.action_size), np.float32)
+            action = self.policy.act(self.parameters, batch, noise)
+        scaled = self.spec.scale_action(action)
+        return scaled.reshape(*observation.shape[:-1], self.spec.action_size), state
+
+
+def save_policy(folder: Path, config: Config, spec: EnvironmentSpec, actor: np.ndarray, facts: dict[str, Any]) -> None:
+    """Write a policy with what is needed to use it; `facts` are told beside it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {"actor": actor, "action_low": spec.action_low, "action_high": spec.action_high}
+    temporary = folder / (ARRAYS + ".partial")
+    temporary.write_bytes(safetensors.numpy.save(arrays))
+    temporary.replace(folder / ARRAYS)
+    description = {
+        "environment": config.environment,
+        "environment_arguments": config.environment_arguments,
+        "observation_size": spec.observation_size,
+        "action_size": spec.action_size,
+        "algorithm": dataclasses.asdict(config.algorithm),
+        **facts,
+    }
+    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
+
+
+def load_policy(run: Path | str) -> TrainedPolicy:
+    """The best policy of a run, from its folder or from its `best` folder; raises UserError if there is none."""
+    folder = Path(run)
+    folder = folder / "best" if (folder / "best").is_dir() else folder
+    if not (folder / ARRAYS).is_file():
+        raise UserError(f"{run} holds no policy yet: the first is kept after the run's first evaluation")
+    arrays = safetensors.numpy.load_file(folder / ARRAYS)
+    description = json.loads((folder / DESCRIPTION).read_text())
+    algorithm = description["algorithm"]
+    settings = AlgorithmSettings(**{**algorithm, "hidden_layers": tuple(algorithm["hidden_layers"])})
+    spec = EnvironmentSpec(
+        description["observation_size"], description["action_size"], arrays["action_low"], arrays["action_high"]
+    )
+    return TrainedPolicy(settings, spec, arrays["actor"])

@@ -1,0 +1,1 @@
+"""A run: the loop, its tests of the policy, and what it leaves on disk."""

@@ -1,0 +1,51 @@
+"""Test episodes with the deterministic policy, stepped side by side with one policy call per step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saclab.environments.make import environment_spec, make_environment
+
+
+class EvaluationEpisodes(NamedTuple):
+    total_rewards: np.ndarray
+    """f64[episodes]."""
+    lengths: np.ndarray
+    """i64[episodes]."""
+
+
+class Evaluator:
+    """Test environments of their own: an evaluation leaves training as it was."""
+
+    def __init__(self, environment: str, arguments: Mapping[str, Any]) -> None:
+        self.name, self.arguments = environment, arguments
+        self.environments = [make_environment(environment, arguments)]
+        self.spec = environment_spec(environment, self.environments[0])
+
+    def run(self, act: Callable[[np.ndarray], np.ndarray], seeds: Sequence[int]) -> EvaluationEpisodes:
+        """One episode per seed; `act` takes observations f32[n, O] and gives actions f32[n, A] in [-1, 1]."""
+        while len(self.environments) < len(seeds):
+            self.environments.append(make_environment(self.name, self.arguments))
+        observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
+        for index, seed in enumerate(seeds):
+            observation[index], _ = self.environments[index].reset(seed=seed)
+        total_rewards, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
+        active = list(range(len(seeds)))
+        while active:
+            actions = self.spec.scale_action(act(observation[active]))
+            going_on = []
+            for index, action in zip(active, actions, strict=True):
+                observation[index], reward, terminated, truncated, _ = self.environments[index].step(action)
+                total_rewards[index] += float(reward)
+                lengths[index] += 1
+                if not (terminated or truncated):
+                    going_on.append(index)
+            active = going_on
+        return EvaluationEpisodes(total_rewards, lengths)
+
+    def close(self) -> None:
+        for environment in self.environments:
+            environment.close()

@@ -1,0 +1,288 @@
+"""The training loop, a generator of events. It does not print, does not handle signals, knows no command line."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from saclab.algorithm.types import Metrics
+from saclab.config import Config
+from saclab.environments.vector import EndedEpisode
+from saclab.errors import UserError
+from saclab.trained_policy import save_policy
+from saclab.training.checkpoint import load_newest_checkpoint, save_checkpoint
+from saclab.training.events import (
+    EpisodeEnded,
+    Evaluated,
+    Event,
+    Finished,
+    Interrupted,
+    Progress,
+    Saved,
+    Started,
+    UpdatesLogged,
+)
+from saclab.training.run import Run
+from saclab.training.run_folder import FORMAT, Logs, is_finished, machine_facts, read_config_file, write_json
+
+PROGRESS_SECONDS = 0.25
+
+
+@dataclass
+class Requests:
+    """What the outside asks of a run; looked at after every step."""
+
+    stop: bool = False
+    """Save and stop."""
+    save: bool = False
+    """Save and go on."""
+
+
+def train(
+    config: Config, folder: Path, requests: Requests | None = None, checkpoint_minutes: float = 10
+) -> Iterator[Event]:
+    """Train, from the start or from the folder's newest checkpoint, until the protocol's end or a request to stop.
+
+    Args:
+        config: what to train.
+        folder: the run folder; made if it does not exist.
+        requests: asks the run to stop or save.
+        checkpoint_minutes: wall-clock time between checkpoints; it does not change the result.
+
+    Raises:
+        UserError: if the folder holds another configuration, or is in use by another process.
+        NonFiniteError, NonFiniteUpdate: if training went wrong; the last checkpoint is kept.
+        CheckpointError: if no checkpoint can be written or read.
+    """
+    if is_finished(folder):
+        require_same_config(folder, config)
+        return
+    with locked(folder):
+        session = Session(config, folder, requests or Requests(), checkpoint_minutes)
+        try:
+            yield from session.events()
+        finally:
+            session.close()
+
+
+class Session:
+    """One process's work on a run: the run, its logs and its clocks."""
+
+    def __init__(self, config: Config, folder: Path, requests: Requests, checkpoint_minutes: float) -> None:
+        self.folder, self.requests = folder, requests
+        self.checkpoint_seconds = 60 * checkpoint_minutes
+        self.notes = [ratio_note(config)]
+        new = not (folder / "config.json").exists()
+        if not new:
+            require_same_config(folder, config)
+        self.run = Run(config)
+        if new:
+            write_json(folder / "config.json", {"format": FORMAT, "config": config.to_dict(), **machine_facts()})
+        positions = None if new else self._restore()
+        self.resumed_at_step = self.run.counters.steps
+        self.logs = Logs(folder, config.training.evaluation_episodes, positions)
+        self._record_session()
+        self.seconds_before = self.run.counters.seconds
+        self.started = self.last_progress = self.last_save = time.monotonic()
+
+    def events(self) -> Iterator[Event]:
+        run = self.run
+        yield Started(self.folder, self.resumed_at_step, tuple(self.notes))
+        while (reason := run.finish_reason()) is None:
+            for episode in run.step():
+                yield from self._log_episode(episode)
+            yield from self._log_updates()
+            if run.evaluation_due():
+                yield self._evaluate()
+            if self.requests.stop:
+                yield self._save()
+                yield Interrupted(run.counters.steps)
+                return
+            now = time.monotonic()
+            if self.requests.save or now - self.last_save > self.checkpoint_seconds:
+                yield self._save()
+            if now - self.last_progress > PROGRESS_SECONDS:
+                self.last_progress = now
+                yield self._progress()
+        yield from self._finish(reason)
+
+    def close(self) -> None:
+        self.logs.close()
+        self.run.close()
+
+    def _seconds(self) -> float:
+        """Wall-clock time of the run, earlier sessions counted in."""
+        return round(self.seconds_before + time.monotonic() - self.started, 3)
+
+    def _progress(self) -> Progress:
+        counters = self.run.counters
+        return Progress(counters.steps, counters.updates, counters.episodes, self.run.fraction_done(), self._seconds())
+
+    def _log_episode(self, episode: EndedEpisode) -> Iterator[Event]:
+        run, counters = self.run, self.run.counters
+        number = run.count_episode(episode)
+        average = counters.running_average if number else episode.total_reward
+        assert average is not None
+        self.logs.episode(
+            number, counters.steps, counters.updates, episode.total_reward, average, episode.length,
+            int(episode.terminated), self._seconds(),
+        )  # fmt: skip
+        if number:
+            yield EpisodeEnded(number, counters.steps, counters.updates, episode.total_reward, average, episode.length)
+
+    def _log_updates(self, last: bool = False) -> Iterator[Event]:
+        """One line for each full window of updates; for what there is, if it is the last."""
+        run, counters = self.run, self.run.counters
+        full = len(run.window) >= run.config.training.log_interval
+        if not (full or (last and run.window)):
+            return
+        values = run.window_array().mean(axis=0, dtype="float64")
+        run.window = []
+        means = dict(zip(Metrics._fields, values.tolist(), strict=True))
+        self.logs.metrics({"updates": counters.updates, "steps": counters.steps, **means, "seconds": self._seconds()})
+        yield UpdatesLogged(counters.steps, counters.updates, means)
+
+    def _evaluate(self) -> Evaluated:
+        run, counters = self.run, self.run.counters
+        episodes, best = run.evaluate()
+        self.logs.evaluation(
+            counters.evaluations, counters.steps, counters.updates, counters.episodes, counters.last_return,
+            *episodes.total_rewards.tolist(), *episodes.lengths.tolist(), self._seconds(),
+        )  # fmt: skip
+        if best:
+            self._write_best()
+        return Evaluated(
+            counters.evaluations, counters.steps, counters.updates, counters.episodes, episodes.total_rewards, best
+        )
+
+    def _write_best(self) -> None:
+        run = self.run
+        if run.best_actor is not None:
+            facts = {"mean_return": run.counters.best_return, "episode": run.counters.best_at_episode}
+            save_policy(self.folder / "best", run.config, run.spec, run.best_actor, facts)
+
+    def _save(self) -> Saved:
+        self.requests.save = False
+        began = time.monotonic()
+        self.run.counters.seconds = self._seconds()
+        checkpoint = self.run.capture()
+        checkpoint.state["logs"] = self.logs.positions()
+        checkpoint.state["facts"] = machine_facts()
+        path = save_checkpoint(self.folder / "checkpoints", self.run.counters.steps, checkpoint, self.run.replay)
+        self.last_save = time.monotonic()
+        return Saved(path, self.last_save - began)
+
+    def _restore(self) -> dict[str, int] | None:
+        """Continue from the newest checkpoint that is whole; the lengths of the logs at that time."""
+        checkpoint = load_newest_checkpoint(self.folder / "checkpoints", self.run.replay, self.notes.append)
+        if checkpoint is None:
+            return None
+        restarted = self.run.restore(checkpoint)
+        if restarted:
+            self.notes.append(
+                f"the exact state of {self.run.config.environment} cannot be captured: environments {restarted} "
+                "started a new episode, so this run is not bit for bit what it would have been"
+            )
+        self.notes += different_facts(checkpoint.state["facts"])
+        self._write_best()
+        positions: dict[str, int] = checkpoint.state["logs"]
+        return positions
+
+    def _record_session(self) -> None:
+        """One line per session in sessions.jsonl: where it began, on what, and what was noted."""
+        entry = {
+            "began": datetime.now(UTC).isoformat(timespec="seconds"),
+            "from_step": self.resumed_at_step,
+            "process": os.getpid(),
+            "notes": self.notes[1:],
+            **machine_facts(),
+        }
+        with (self.folder / "sessions.jsonl").open("a") as file:
+            file.write(json.dumps(entry) + "\n")
+
+    def _finish(self, reason: str) -> Iterator[Event]:
+        counters = self.run.counters
+        yield from self._log_updates(last=True)
+        if counters.evaluated_at_update != counters.updates:
+            yield self._evaluate()
+        counters.seconds = self._seconds()
+        yield self._save()
+        assert counters.best_return is not None
+        assert counters.last_return is not None
+        result = {
+            "reason": reason,
+            "steps": counters.steps,
+            "updates": counters.updates,
+            "episodes": counters.episodes,
+            "best_return": counters.best_return,
+            "final_return": counters.last_return,
+            "seconds": counters.seconds,
+        }
+        write_json(self.folder / "result.json", result)
+        yield self._progress()
+        yield Finished(
+            reason, counters.steps, counters.updates, counters.episodes, counters.best_return, counters.last_return
+        )
+
+
+def ratio_note(config: Config) -> str:
+    training = config.training
+    note = (
+        f"{training.updates_per_interval} update(s) per {training.update_interval} environment step(s): "
+        f"update-to-data ratio {training.update_to_data_ratio:g}"
+    )
+    if training.parallel_environments > 1:
+        each = training.parallel_environments * training.update_to_data_ratio
+        note += (
+            f", kept with {training.parallel_environments} environments: {each:g} update(s) on average "
+            "each time all of them have been stepped"
+        )
+    return note
+
+
+def require_same_config(folder: Path, config: Config) -> None:
+    """Refuse a folder that holds a run with other settings."""
+    differences = Config.from_dict(read_config_file(folder)["config"]).differences(config)
+    if differences:
+        listed = "; ".join(f"{name} is {there!r} there, {here!r} here" for name, (there, here) in differences.items())
+        raise UserError(
+            f"{folder} already holds a run with other settings ({listed}): give this one a name of its own with "
+            "--name, or another place with --runs"
+        )
+
+
+def different_facts(saved: dict[str, dict[str, object]]) -> list[str]:
+    """Warnings for each version or machine fact that is not what the checkpoint was made with."""
+    return [
+        f"{name} was {then[name]} when the checkpoint was made and is {value} now: results may differ in the last bits"
+        + (f"; set NPROC={then[name]} to continue exactly" if name == "threads" else "")
+        for part, now in machine_facts().items()
+        for then in [saved[part]]
+        for name, value in now.items()
+        if then.get(name) != value
+    ]
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the run folder; the system lets go of it when the process ends, however it ends."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            raise UserError(
+                f"{folder} is in use by process {file.read().strip() or '?'}: wait for it, or stop it first"
+            ) from error
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        yield

@@ -1,0 +1,71 @@
+"""The variants of SAC, each a row of data: what differs from plain SAC.
+
+A variant is a point in the space of `AlgorithmSettings`; any other setting can be changed beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from saclab.config import AlgorithmSettings, replace_settings
+from saclab.errors import unknown_name
+
+
+@dataclass(frozen=True)
+class Variant:
+    title: str
+    """As it stands in figures and tables."""
+    description: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    """What differs from plain SAC."""
+    paper_name: str | None = None
+    """The name of the system in the paper's figures and Table 2, if it stands there."""
+
+
+LEARNED = {"temperature": "learned", "initial_temperature": 1.0}
+AVERAGED = {"snapshots": 10}
+
+VARIANTS: dict[str, Variant] = {
+    "sac": Variant(
+        "SAC",
+        "Fixed temperature, the smaller of two Q-networks, Polyak targets (Eq. 2-5).",
+        paper_name="sac",
+    ),
+    "sac-auto": Variant(
+        "SAC, learned α",
+        "The temperature is learned so that the policy keeps a target entropy (Eq. 8).",
+        LEARNED,
+        paper_name="sac-alpha-tuning",
+    ),
+    "averaged": Variant(
+        "Averaged-SAC",
+        "The next state's value is the mean over the last K target networks (Eq. 9).",
+        AVERAGED,
+        paper_name="averaged-sac",
+    ),
+    "averaged-auto": Variant(
+        "Averaged-SAC, learned α",
+        "Averaged targets (Eq. 9) and a learned temperature (Eq. 8): the paper's first future experiment.",
+        AVERAGED | LEARNED,
+    ),
+    "averaged-entropy": Variant(
+        "Averaged entropy term (not Eq. 9)",
+        "What the paper's authors ran under the name Averaged-SAC: no value is averaged, only the entropy term "
+        "α·log π, row by row over the last K unrelated minibatches. Kept to test their published numbers.",
+        {"entropy_window": 10},
+    ),
+}
+
+
+def fixed_temperature(environment: str) -> float:
+    """The paper's fixed α (Table 1): 0.1 on Humanoid; 0.2 on HalfCheetah and, here, everywhere else."""
+    return 0.1 if environment.startswith("Humanoid-") else 0.2
+
+
+def variant_settings(variant: str, environment: str) -> AlgorithmSettings:
+    """The settings of a variant on an environment; raises UserError for an unknown variant."""
+    if variant not in VARIANTS:
+        raise unknown_name("variant", variant, VARIANTS)
+    plain = AlgorithmSettings(initial_temperature=fixed_temperature(environment))
+    return replace_settings(plain, VARIANTS[variant].settings)

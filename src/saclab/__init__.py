@@ -1,0 +1,32 @@
+"""saclab: a laboratory for Soft Actor-Critic."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from saclab.api import Comparison, compare, resume, train
+    from saclab.errors import UserError
+    from saclab.trained_policy import TrainedPolicy, load_policy
+    from saclab.training.run_folder import RunRecord, read_run
+
+__all__ = [
+    "Comparison", "RunRecord", "TrainedPolicy", "UserError", "compare", "load_policy", "read_run", "resume", "train",
+]  # fmt: skip
+
+_HOMES = {
+    "saclab.api": ("Comparison", "compare", "resume", "train"),
+    "saclab.errors": ("UserError",),
+    "saclab.trained_policy": ("TrainedPolicy", "load_policy"),
+    "saclab.training.run_folder": ("RunRecord", "read_run"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use, so that `import saclab` and `saclab --help` do not wait for JAX."""
+    from importlib import import_module
+
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(module), name)
+    raise AttributeError(f"module 'saclab' has no attribute {name!r}")

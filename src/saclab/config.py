@@ -155,7 +155,8 @@ class TrainingSettings:
         require(
             (self.evaluation_interval_episodes is None) != (self.evaluation_interval_steps is None),
             "evaluation_interval_episodes", self.evaluation_interval_episodes,
-            "give exactly one of evaluation_interval_episodes and evaluation_interval_steps",
+            f"give exactly one of it and evaluation_interval_steps (now {self.evaluation_interval_steps}), "
+            "and None for the other",
         )  # fmt: skip
 
     @property

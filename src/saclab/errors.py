@@ -6,8 +6,11 @@ import difflib
 from collections.abc import Iterable
 
 
-class UserError(ValueError):
-    """Something the user gave cannot work; the message names it and the way out."""
+class UserError(Exception):
+    """Something the user gave cannot work; the message names it and the way out.
+
+    Not a ValueError: the command-line parser would put those into a message of its own.
+    """
 
 
 class SettingError(UserError):
@@ -16,6 +19,10 @@ class SettingError(UserError):
     def __init__(self, setting: str, value: object, way_out: str) -> None:
         super().__init__(f"{setting} = {value!r}: {way_out}")
         self.setting, self.value, self.way_out = setting, value, way_out
+
+
+class TrainingFailed(RuntimeError):  # noqa: N818 - it names what happened
+    """A run cannot go on; what it had saved is kept. The command line exits with status 1."""
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:

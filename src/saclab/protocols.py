@@ -15,6 +15,8 @@ from saclab.variants import variant_settings
 class Protocol:
     description: str
     settings: TrainingSettings
+    seeds: int = 5
+    """Seeds of a comparison, unless another number is asked for."""
     by_environment: dict[str, dict[str, Any]] = field(default_factory=dict)
     """What differs for environments whose id starts with a key."""
     algorithm: dict[str, Any] = field(default_factory=dict)
@@ -61,6 +63,7 @@ PROTOCOLS: dict[str, Protocol] = {
             evaluation_episodes=5,
             log_interval=100,
         ),
+        seeds=1,
     ),
 }
 

@@ -49,14 +49,17 @@ class TrainedPolicy:
         size = self.spec.observation_size
         if observation.ndim not in (1, 2) or observation.shape[-1] != size:
             raise UserError(f"observation has shape {observation.shape}, and this policy takes [{size}] or [N, {size}]")
-        batch = np.atleast_2d(observation)
+        action = self.normalised_action(np.atleast_2d(observation), deterministic)
+        return self.spec.scale_action(action).reshape(*observation.shape[:-1], self.spec.action_size), state
+
+    def normalised_action(self, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """Actions f32[N, A] in [-1, 1] for f32[N, O]."""
         if deterministic:
-            action = self.policy.mode(self.parameters, batch)
-        else:
-            noise = self.generator.standard_normal((len(batch), self.spec.action_size), np.float32)
-            action = self.policy.act(self.parameters, batch, noise)
-        scaled = self.spec.scale_action(action)
-        return scaled.reshape(*observation.shape[:-1], self.spec.action_size), state
+            action: np.ndarray = self.policy.mode(self.parameters, observation)
+            return action
+        noise = self.generator.standard_normal((len(observation), self.spec.action_size), np.float32)
+        action = self.policy.act(self.parameters, observation, noise)
+        return action
 
 
 def save_policy(folder: Path, config: Config, spec: EnvironmentSpec, actor: np.ndarray, facts: dict[str, Any]) -> None:
@@ -77,14 +80,24 @@ def save_policy(folder: Path, config: Config, spec: EnvironmentSpec, actor: np.n
     (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
 
 
+def policy_folder(run: Path) -> Path:
+    """Where the policy of a run lies: `best` in a run folder, or the folder itself."""
+    return run / "best" if (run / "best").is_dir() else run
+
+
+def read_description(run: Path) -> dict[str, Any]:
+    """policy.json: the environment the policy is for, and its settings."""
+    description: dict[str, Any] = json.loads((policy_folder(run) / DESCRIPTION).read_text())
+    return description
+
+
 def load_policy(run: Path | str) -> TrainedPolicy:
     """The best policy of a run, from its folder or from its `best` folder; raises UserError if there is none."""
-    folder = Path(run)
-    folder = folder / "best" if (folder / "best").is_dir() else folder
+    folder = policy_folder(Path(run))
     if not (folder / ARRAYS).is_file():
         raise UserError(f"{run} holds no policy yet: the first is kept after the run's first evaluation")
     arrays = safetensors.numpy.load_file(folder / ARRAYS)
-    description = json.loads((folder / DESCRIPTION).read_text())
+    description = read_description(folder)
     algorithm = description["algorithm"]
     settings = AlgorithmSettings(**{**algorithm, "hidden_layers": tuple(algorithm["hidden_layers"])})
     spec = EnvironmentSpec(

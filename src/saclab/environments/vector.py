@@ -9,6 +9,7 @@ import numpy as np
 
 from saclab.environments.make import environment_spec, make_environment
 from saclab.environments.simulator import capture_state, restore_state
+from saclab.errors import TrainingFailed
 
 
 class Transitions(NamedTuple):
@@ -33,7 +34,7 @@ class EndedEpisode(NamedTuple):
     terminated: bool
 
 
-class NonFiniteError(RuntimeError):
+class NonFiniteError(TrainingFailed):
     """An environment gave an observation or a reward that is not a finite number."""
 
 

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import safetensors.numpy
 
+from saclab.errors import TrainingFailed
 from saclab.replay import ReplayBuffer
 
 FORMAT = 1
@@ -37,7 +38,7 @@ SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
 Arrays = dict[str, np.ndarray]
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(TrainingFailed):
     """A checkpoint could not be written, or none that is whole could be read."""
 
 

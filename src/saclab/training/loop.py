@@ -8,7 +8,6 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -29,20 +28,11 @@ from saclab.training.events import (
     Started,
     UpdatesLogged,
 )
+from saclab.training.requests import Requests
 from saclab.training.run import Run
 from saclab.training.run_folder import FORMAT, Logs, is_finished, machine_facts, read_config_file, write_json
 
 PROGRESS_SECONDS = 0.25
-
-
-@dataclass
-class Requests:
-    """What the outside asks of a run; looked at after every step."""
-
-    stop: bool = False
-    """Save and stop."""
-    save: bool = False
-    """Save and go on."""
 
 
 def train(
@@ -58,8 +48,7 @@ def train(
 
     Raises:
         UserError: if the folder holds another configuration, or is in use by another process.
-        NonFiniteError, NonFiniteUpdate: if training went wrong; the last checkpoint is kept.
-        CheckpointError: if no checkpoint can be written or read.
+        TrainingFailed: if a number is not finite or no checkpoint can be written or read; what was saved is kept.
     """
     if is_finished(folder):
         require_same_config(folder, config)

@@ -16,6 +16,7 @@ from saclab.algorithm.learner import make_learner
 from saclab.algorithm.types import LearnerState, Metrics
 from saclab.config import AlgorithmSettings, Config
 from saclab.environments.vector import EndedEpisode, TrainingEnvironments
+from saclab.errors import TrainingFailed
 from saclab.replay import ReplayBuffer, RowLayout, require_memory
 from saclab.training import seeds
 from saclab.training.checkpoint import Arrays, Checkpoint
@@ -24,7 +25,7 @@ from saclab.training.evaluation import EvaluationEpisodes, Evaluator
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
 
 
-class NonFiniteUpdate(RuntimeError):  # noqa: N818 - it names what happened
+class NonFiniteUpdate(TrainingFailed):
     """An update gave a loss, a temperature or a value that is not a finite number."""
 
 

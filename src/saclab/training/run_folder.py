@@ -89,6 +89,14 @@ def read_config_file(run: Path) -> dict[str, Any]:
     return content
 
 
+def read_last_session(run: Path) -> dict[str, Any]:
+    """The facts of the last session that worked on a run; those of its making if it has no session yet."""
+    path = run / "sessions.jsonl"
+    lines = path.read_text().splitlines() if path.is_file() else []
+    session: dict[str, Any] = json.loads(lines[-1]) if lines else read_config_file(run)
+    return session
+
+
 def is_finished(run: Path) -> bool:
     return (run / "result.json").is_file()
 

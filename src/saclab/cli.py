@@ -1,0 +1,331 @@
+"""The command line: what each command takes, and which function it calls. No logic lives here.
+
+Nothing slow is imported before a command runs, so that `saclab --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from tyro.conf import OmitArgPrefixes, Positional, subcommand
+
+from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names
+from saclab.errors import SettingError, TrainingFailed, UserError
+from saclab.protocols import PROTOCOLS, make_config
+from saclab.variants import VARIANTS
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+EXIT_USER_ERROR = 2
+EXIT_FAILED = 1
+
+
+@dataclass(frozen=True)
+class Where:
+    runs: Path = Path("runs")
+    """Folder that holds all runs."""
+    checkpoint_minutes: float = 10
+    """Wall-clock time between checkpoints; it does not change any result."""
+    environment_arguments: str = "{}"
+    """Keyword arguments of the environment, as JSON: '{"reset_noise_scale": 0.0}'."""
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train one run; finds and continues it if it was stopped. Every setting below can be changed."""
+
+    environment: Positional[str]
+    """Gymnasium id, such as HalfCheetah-v4, or package.module:Name-v0 to import the package first."""
+    algorithm: OmitArgPrefixes[AlgorithmSettings]
+    training: OmitArgPrefixes[TrainingSettings]
+    variant: str = "sac-auto"
+    """See `saclab variants`."""
+    protocol: str = "standard"
+    """See `saclab protocols`."""
+    seed: int = 0
+    """Every random draw of the run derives from it."""
+    name: str | None = None
+    """Takes the variant's place in the run folder's path, for runs with other settings."""
+    threads: int | None = None
+    """Cores that XLA uses; None for all. Results depend on it in the last bits."""
+    where: OmitArgPrefixes[Where] = field(default_factory=Where)
+
+    def __call__(self, console: Console) -> int:
+        limit_threads(self.threads)
+        from saclab.training.run_folder import run_path
+
+        config = Config(
+            self.environment, self.variant, self.protocol, self.seed, self.algorithm, self.training,
+            parse_arguments(self.where.environment_arguments),
+        )  # fmt: skip
+        folder = run_path(self.where.runs, config, self.name)
+        return train_and_show(config, folder, self.where.checkpoint_minutes, console)
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Continue a run from its newest checkpoint."""
+
+    run: Positional[Path]
+    """The run folder."""
+    checkpoint_minutes: float = 10
+    """Wall-clock time between checkpoints."""
+    threads: int | None = None
+    """Cores that XLA uses; None for as many as the run has used so far."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.training.run_folder import read_config, read_last_session
+
+        config = read_config(self.run)
+        limit_threads(self.threads or read_last_session(self.run)["machine"]["threads"])
+        return train_and_show(config, self.run, self.checkpoint_minutes, console)
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train every variant on every environment with every seed, then write a report.
+
+    Finished runs are skipped, unfinished ones continued. The settings shown below are those of the protocol; one
+    that is given is changed in every run.
+    """
+
+    environments: Positional[tuple[str, ...]]
+    """Gymnasium ids."""
+    algorithm: OmitArgPrefixes[AlgorithmSettings]
+    training: OmitArgPrefixes[TrainingSettings]
+    variants: tuple[str, ...] = ("sac", "sac-auto", "averaged", "averaged-auto")
+    """See `saclab variants`."""
+    protocol: str = "standard"
+    """See `saclab protocols`."""
+    seeds: int | None = None
+    """How many seeds, counted from first_seed; None for the protocol's own number."""
+    first_seed: int = 0
+    workers: int | None = None
+    """Runs at a time; None for one per core."""
+    threads: int = 1
+    """Cores that each run uses. Results depend on it in the last bits."""
+    report: Path | None = None
+    """Folder of the report; None for report in the runs' folder."""
+    where: OmitArgPrefixes[Where] = field(default_factory=Where)
+    given: tyro.conf.Suppress[frozenset[str]] = frozenset()
+    """Names of the settings that stand on the command line."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import api, display
+
+        if not self.environments:
+            raise SettingError("environments", (), "name at least one, such as: saclab compare HalfCheetah-v4")
+        count = self.seeds if self.seeds is not None else PROTOCOLS[self.protocol].seeds
+        if count < 1:
+            raise SettingError("seeds", count, "use at least 1")
+        settings: tuple[Any, ...] = (self.algorithm, self.training)
+        overrides = {
+            name: getattr(part, name) for part in settings for name in field_names(type(part)) if name in self.given
+        }
+        result = api.compare(
+            self.environments, self.variants, range(self.first_seed, self.first_seed + count), self.protocol,
+            workers=self.workers, threads=self.threads, runs=self.where.runs, report=self.report,
+            environment_arguments=parse_arguments(self.where.environment_arguments),
+            show=lambda stream: display.show_grid(stream, console),
+            checkpoint_minutes=self.where.checkpoint_minutes, **overrides,
+        )  # fmt: skip
+        return display.show_comparison(result, console)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Test a run's best policy on fresh episodes."""
+
+    run: Positional[Path]
+    """The run folder, or a folder that holds a policy."""
+    episodes: int = 20
+    """Test episodes, stepped side by side."""
+    seed: int = 1_000_000
+    """Of the episodes' starts; other than in training, where the policy was chosen."""
+    stochastic: bool = False
+    """Sample actions in place of the mean action."""
+    json: bool = False
+    """Print one line of JSON."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import playback
+
+        if self.episodes < 1:
+            raise SettingError("episodes", self.episodes, "use at least 1")
+        result = playback.evaluate(self.run, self.episodes, self.seed, deterministic=not self.stochastic)
+        console.print(json.dumps(result._asdict()) if self.json else result.sentence(), soft_wrap=True, highlight=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class Record:
+    """Film a run's best policy; needs no screen."""
+
+    run: Positional[Path]
+    """The run folder."""
+    video: Path | None = None
+    """File to write; None for best/video.mp4 in the run folder, where the report finds it."""
+    steps: int = 300
+    """Environment steps to film at most."""
+    seed: int = 1_000_000
+    """Of the episode's start."""
+    size: int = 320
+    """Width and height in pixels."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import playback
+
+        path = self.video or self.run / "best" / "video.mp4"
+        console.print(playback.record(self.run, path, self.steps, self.seed, self.size), soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write the comparison of finished and unfinished runs: a page, figures, tables."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Run folders, or folders that hold some."""
+    out: Path = Path("report")
+    """Folder to write to."""
+    allow_mixed: bool = False
+    """Pool runs that differ in more than variant and seed."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.comparison.report import write_report
+        from saclab.training.run_folder import find_runs
+
+        page = write_report(find_runs(self.runs or (Path("runs"),)), self.out, allow_mixed=self.allow_mixed)
+        console.print(f"report: {page.resolve()}", soft_wrap=True, markup=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class Variants:
+    """List the variants of SAC."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import display
+
+        console.print(display.catalogue({name: (row.description, row.settings) for name, row in VARIANTS.items()}))
+        return 0
+
+
+@dataclass(frozen=True)
+class Protocols:
+    """List the training protocols."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import display
+
+        rows = {name: (row.description, display.changed_settings(row.settings)) for name, row in PROTOCOLS.items()}
+        console.print(display.catalogue(rows))
+        return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns its exit status: 0, 1 if a run failed, 2 for a user's error, 130 or 143 for a signal."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        command = parse(arguments or ["--help"])
+        from rich.console import Console
+
+        return int(command(Console()))
+    except UserError as error:
+        print(f"saclab: {error}", file=sys.stderr)
+        return EXIT_USER_ERROR
+
+
+def parse(arguments: Sequence[str]) -> Any:
+    """The command that the words ask for, its settings by default those of its environment, variant and protocol.
+
+    The three are guessed first, so that --help shows the values that a run would have; if the whole line then says
+    something else, such as after `--seed 3 Humanoid-v4`, it is parsed again with what it said.
+    """
+    words = [word for word in arguments[1:] if not word.startswith("-")]
+    variant, protocol = (option_value(arguments, name) for name in ("variant", "protocol"))
+    guess = (words[0] if words else "HalfCheetah-v4", variant or "sac-auto", protocol or "standard")
+    command = parse_with_defaults(arguments, *guess)
+    if isinstance(command, Train) and guess != (said := (command.environment, command.variant, command.protocol)):
+        command = parse_with_defaults(arguments, *said)
+    return command
+
+
+def parse_with_defaults(arguments: Sequence[str], environment: str, variant: str, protocol: str) -> Any:
+    config = make_config(environment, variant, protocol)
+    given = frozenset(word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--"))
+    train = Train(tyro.MISSING, config.algorithm, config.training)
+    compare = Compare(tyro.MISSING, config.algorithm, config.training, given=given)
+    commands: Any = (
+        Annotated[Train, subcommand("train", default=train)]
+        | Annotated[Compare, subcommand("compare", default=compare)]
+        | Annotated[Resume, subcommand("resume")]
+        | Annotated[Report, subcommand("report")]
+        | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Record, subcommand("record")]
+        | Annotated[Variants, subcommand("variants")]
+        | Annotated[Protocols, subcommand("protocols")]
+    )
+    description = "A laboratory for Soft Actor-Critic: train its variants, compare them, reproduce the paper."
+    return tyro.cli(commands, prog="saclab", description=description, args=list(arguments))
+
+
+def option_value(arguments: Sequence[str], name: str) -> str | None:
+    """The value of --name in either of its forms, before the whole line is parsed."""
+    for index, word in enumerate(arguments):
+        if word == f"--{name}" and index + 1 < len(arguments):
+            return arguments[index + 1]
+        if word.startswith(f"--{name}="):
+            return word.partition("=")[2]
+    return None
+
+
+def parse_arguments(text: str) -> dict[str, Any]:
+    """Keyword arguments of an environment from JSON; raises SettingError for anything but an object."""
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise SettingError("environment_arguments", text, f"not JSON ({error}); write '{{\"key\": 1.0}}'") from error
+    if not isinstance(values, dict):
+        raise SettingError("environment_arguments", text, "write a JSON object, such as '{\"key\": 1.0}'")
+    return values
+
+
+def limit_threads(threads: int | None) -> None:
+    """Hold XLA and NumPy to a number of cores; works only before they are first imported."""
+    from saclab.comparison.launch import thread_limits
+
+    if threads is not None:
+        if threads < 1:
+            raise SettingError("threads", threads, "use at least 1")
+        os.environ.update(thread_limits(threads))
+
+
+def train_and_show(config: Config, folder: Path, checkpoint_minutes: float, console: Console) -> int:
+    """Train in this process with a progress bar."""
+    from saclab import display
+    from saclab.signals import EXIT_STATUS, requests_from_signals
+    from saclab.training.loop import train
+    from saclab.training.run_folder import is_finished
+
+    if is_finished(folder):
+        console.print(f"{folder} is finished already; its results are kept", soft_wrap=True, markup=False)
+    with requests_from_signals() as requests:
+        try:
+            for _ in display.show_run(train(config, folder, requests, checkpoint_minutes), console):
+                pass
+        except TrainingFailed as error:
+            print(f"saclab: {error}", file=sys.stderr)
+            return EXIT_FAILED
+        if requests.stop:
+            console.print(f"saved; continue with: saclab resume {folder}", soft_wrap=True, markup=False)
+            return EXIT_STATUS.get(requests.stop, EXIT_FAILED)
+    return 0

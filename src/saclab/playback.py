@@ -1,0 +1,96 @@
+"""Use a trained policy: test it on fresh episodes, film it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from saclab.environments.make import make_environment
+from saclab.errors import UserError
+from saclab.trained_policy import TrainedPolicy, load_policy, read_description
+from saclab.training.evaluation import Evaluator
+
+
+class TestResult(NamedTuple):
+    """Of `evaluate`."""
+
+    environment: str
+    episodes: int
+    mean_return: float
+    standard_deviation: float
+    total_rewards: list[float]
+    lengths: list[int]
+
+    def sentence(self) -> str:
+        worst, best = min(self.total_rewards), max(self.total_rewards)
+        return (
+            f"{self.environment}: return {self.mean_return:.1f} ± {self.standard_deviation:.1f} over {self.episodes} "
+            f"episodes (from {worst:.1f} to {best:.1f}), mean length {np.mean(self.lengths):.0f}"
+        )
+
+
+def evaluate(run: Path, episodes: int, seed: int, deterministic: bool = True) -> TestResult:
+    """Test a run's best policy; raises UserError if it has none."""
+    policy, description = load_policy(run), read_description(run)
+    evaluator = Evaluator(description["environment"], description["environment_arguments"])
+    seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
+    result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
+    evaluator.close()
+    return TestResult(
+        description["environment"], episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
+        result.total_rewards.tolist(), result.lengths.tolist(),
+    )  # fmt: skip
+
+
+def record(run: Path, video: Path, steps: int, seed: int, size: int) -> str:
+    """Film the best policy from the start of an episode, at the environment's own speed; says what was filmed.
+
+    Raises:
+        UserError: if the run has no policy, or the environment cannot be rendered here.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    import imageio.v2 as imageio
+
+    policy, description = load_policy(run), read_description(run)
+    arguments: dict[str, Any] = dict(description["environment_arguments"])
+    sized = arguments | {"width": size, "height": size}
+    try:
+        environment = make_environment(description["environment"], sized, render_mode="rgb_array")
+    except UserError:  # not every environment can be told a size
+        environment = make_environment(description["environment"], arguments, render_mode="rgb_array")
+    frames_per_second = environment.metadata.get("render_fps", 30)
+    video.parent.mkdir(parents=True, exist_ok=True)
+    partial = video.with_name(video.stem + ".partial" + video.suffix)
+    try:
+        with imageio.get_writer(partial, fps=frames_per_second, macro_block_size=2, quality=6) as writer:
+            total_reward, filmed = film(environment, policy, writer, steps, seed)
+    except gymnasium.error.DependencyNotInstalled as error:
+        raise UserError(f"{description['environment']} cannot be filmed: {error}") from error
+    except ValueError as error:
+        raise UserError(f"video = {str(video)!r}: {error}; use a name that ends in .mp4") from error
+    finally:
+        environment.close()
+    partial.replace(video)
+    return f"{video}: {filmed} steps, return {total_reward:.1f} until then"
+
+
+def film(environment: Any, policy: TrainedPolicy, writer: Any, steps: int, seed: int) -> tuple[float, int]:
+    """Write one frame per step, until the episode ends or `steps` are done; the return and the steps."""
+    observation, _ = environment.reset(seed=seed)
+    total_reward, filmed = 0.0, 0
+    while filmed < steps:
+        writer.append_data(environment.render())
+        action, _ = policy.predict(observation)
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        total_reward += float(reward)
+        filmed += 1
+        if terminated or truncated:
+            break
+    return total_reward, filmed

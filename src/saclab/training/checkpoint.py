@@ -169,7 +169,7 @@ def segment_version(index: int, replay: ReplayBuffer) -> int:
 
 def write_arrays(path: Path, arrays: Arrays) -> dict[str, Any]:
     """Write a safetensors file; its manifest entry."""
-    content = safetensors.numpy.save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
+    content = safetensors.numpy.save({name: np.array(array, order="C") for name, array in arrays.items()})
     write_bytes(path, content)
     return {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
 

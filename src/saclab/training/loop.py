@@ -53,25 +53,29 @@ def train(
     if is_finished(folder):
         require_same_config(folder, config)
         return
-    with locked(folder):
-        session = Session(config, folder, requests or Requests(), checkpoint_minutes)
-        try:
-            yield from session.events()
-        finally:
-            session.close()
+    run = Run(config)  # before the folder is touched: bad input leaves nothing behind
+    try:
+        with locked(folder):
+            session = Session(run, folder, requests or Requests(), checkpoint_minutes)
+            try:
+                yield from session.events()
+            finally:
+                session.logs.close()
+    finally:
+        run.close()
 
 
 class Session:
     """One process's work on a run: the run, its logs and its clocks."""
 
-    def __init__(self, config: Config, folder: Path, requests: Requests, checkpoint_minutes: float) -> None:
-        self.folder, self.requests = folder, requests
+    def __init__(self, run: Run, folder: Path, requests: Requests, checkpoint_minutes: float) -> None:
+        self.run, self.folder, self.requests = run, folder, requests
+        config = run.config
         self.checkpoint_seconds = 60 * checkpoint_minutes
         self.notes = [ratio_note(config)]
         new = not (folder / "config.json").exists()
         if not new:
             require_same_config(folder, config)
-        self.run = Run(config)
         if new:
             write_json(folder / "config.json", {"format": FORMAT, "config": config.to_dict(), **machine_facts()})
         positions = None if new else self._restore()
@@ -101,10 +105,6 @@ class Session:
                 self.last_progress = now
                 yield self._progress()
         yield from self._finish(reason)
-
-    def close(self) -> None:
-        self.logs.close()
-        self.run.close()
 
     def _seconds(self) -> float:
         """Wall-clock time of the run, earlier sessions counted in."""

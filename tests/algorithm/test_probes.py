@@ -1,0 +1,120 @@
+"""Problems whose soft values are known on paper: the learner must find them, entropy included.
+
+Every problem is a stream of synthetic batches, one observation and one action wide. Where the reward does not depend
+on the action, the best policy is the uniform one, of entropy log 2 on [-1, 1].
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import jax
+import numpy as np
+import pytest
+
+from saclab.algorithm.learner import make_learner
+from saclab.algorithm.networks import NETWORKS
+from saclab.algorithm.types import Batch
+from saclab.config import AlgorithmSettings
+
+DISCOUNT, ALPHA, UPDATES, BATCH = 0.6, 0.5, 1000, 32
+UNIFORM_ENTROPY = math.log(2)
+SETTINGS = {
+    "discount": DISCOUNT,
+    "initial_temperature": ALPHA,
+    "batch_size": BATCH,
+    "hidden_layers": (16,),
+    "polyak_rate": 0.05,
+    "critic_learning_rate": 5e-3,
+    "actor_learning_rate": 5e-3,
+    "temperature_learning_rate": 5e-3,
+}
+
+
+@lru_cache(maxsize=8)
+def trainer(settings: AlgorithmSettings):
+    learner = make_learner(settings, 1, 1)
+    return learner, jax.jit(lambda state, batches: jax.lax.scan(learner.update, state, batches))
+
+
+def stream(reward, state, next_state, terminated, action) -> Batch:
+    """All updates' batches, from arrays or numbers that fit [UPDATES, BATCH]."""
+    columns = (np.broadcast_to(x, (UPDATES, BATCH)).astype(np.float32) for x in (reward, state, next_state, terminated))
+    reward, state, next_state, terminated = columns
+    return Batch(state[..., None], action[..., None], reward, next_state[..., None], terminated)
+
+
+def uniform_actions() -> np.ndarray:
+    return np.random.default_rng(0).uniform(-1, 1, (UPDATES, BATCH)).astype(np.float32)
+
+
+class Trained:
+    """A learner after a stream of batches."""
+
+    def __init__(self, batches: Batch, **changes) -> None:
+        settings = AlgorithmSettings(**{**SETTINGS, **changes})
+        self.learner, train = trainer(settings)
+        self.state, metrics = train(self.learner.init(jax.random.PRNGKey(0)), batches)
+        self.metrics = jax.tree.map(lambda values: float(np.mean(values[-100:])), metrics)
+        self.network = NETWORKS["mlp"](2, settings.hidden_layers, 1, settings.activation)
+
+    def q(self, state: float, action: float = 0.3) -> list[float]:
+        """Each critic's value."""
+        inputs = np.array([state, action], np.float32)
+        return [float(self.network.apply(critic, inputs)[0]) for critic in np.asarray(self.state.critic)]
+
+    def actions(self, state: float, count: int = 20_000) -> np.ndarray:
+        noise = np.random.default_rng(0).standard_normal((count, 1)).astype(np.float32)
+        observation = np.full((count, 1), state, np.float32)
+        return self.learner.policy.act(np.asarray(self.state.actor), observation, noise)[:, 0]
+
+
+def test_a_one_step_episode_is_worth_its_reward_without_any_entropy():
+    trained = Trained(stream(reward=2.0, state=1.0, next_state=1.0, terminated=1, action=uniform_actions()))
+    assert trained.q(1.0) == pytest.approx([2.0, 2.0], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"snapshots": 3, "snapshot_interval": 5}, {"entropy_window": 10}],
+    ids=["sac", "averaged", "averaged-entropy"],
+)
+def test_an_episode_that_only_time_ends_is_worth_all_its_future_rewards_and_entropies(changes):
+    batches = stream(reward=2.0, state=1.0, next_state=1.0, terminated=0, action=uniform_actions())
+    trained = Trained(batches, **changes)
+    assert trained.metrics.entropy == pytest.approx(UNIFORM_ENTROPY, abs=0.02)
+    worth = 2.0 / (1 - DISCOUNT) + DISCOUNT / (1 - DISCOUNT) * ALPHA * UNIFORM_ENTROPY  # 5 + 0.52
+    assert trained.q(1.0) == pytest.approx([worth, worth], abs=0.08)
+
+
+def test_along_a_chain_the_last_state_has_its_reward_and_the_one_before_the_discounted_soft_value():
+    first = np.arange(BATCH) % 2 == 0
+    batches = stream(
+        reward=np.where(first, -1.0, 3.0),
+        state=np.where(first, -1.0, 1.0),
+        next_state=np.where(first, 1.0, 0.0),
+        terminated=~first,
+        action=uniform_actions(),
+    )
+    trained = Trained(batches)
+    assert trained.q(1.0) == pytest.approx([3.0, 3.0], abs=0.08)
+    before = -1.0 + DISCOUNT * (3.0 + ALPHA * UNIFORM_ENTROPY)  # 1.01, of which entropy 0.21
+    assert trained.q(-1.0) == pytest.approx([before, before], abs=0.08)
+
+
+def test_the_policy_prefers_the_rewarded_actions_as_much_as_the_temperature_lets_it():
+    actions = uniform_actions()
+    trained = Trained(stream(reward=2 * actions, state=1.0, next_state=1.0, terminated=1, action=actions))
+    # The best policy is proportional to exp(2a / α) on [-1, 1]: mean coth(2/α) - α/2
+    assert trained.actions(1.0).mean() == pytest.approx(1 / math.tanh(2 / ALPHA) - ALPHA / 2, abs=0.05)
+    assert trained.q(1.0, 0.5) == pytest.approx([1.0, 1.0], abs=0.1)
+
+
+def test_the_learned_temperature_settles_where_the_policy_has_the_target_entropy():
+    actions = uniform_actions()
+    batches = stream(reward=-3 * actions**2, state=1.0, next_state=1.0, terminated=1, action=actions)
+    trained = Trained(batches, temperature="learned", target_entropy=0.0)
+    # exp(-3a²/α) is close to a Gaussian of variance α/6, whose entropy ½ log(2πe α/6) is 0 at α = 6/(2πe)
+    assert trained.metrics.entropy == pytest.approx(0.0, abs=0.05)
+    assert trained.metrics.temperature == pytest.approx(6 / (2 * math.pi * math.e), rel=0.15)

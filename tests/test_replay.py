@@ -1,0 +1,138 @@
+"""The replay buffer against a plain list of the last transitions."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from scipy.stats import chisquare
+
+from saclab import replay
+from saclab.environments.vector import Transitions
+from saclab.errors import SettingError
+from saclab.replay import ReplayBuffer, RowLayout, available_memory, require_memory
+
+LAYOUT = RowLayout(observation_size=3, action_size=2)
+
+
+def transitions(generator: np.random.Generator, count: int) -> Transitions:
+    return Transitions(
+        observation=generator.standard_normal((count, 3)).astype(np.float32),
+        action=generator.uniform(-1, 1, (count, 2)).astype(np.float32),
+        reward=generator.standard_normal(count).astype(np.float32),
+        next_observation=generator.standard_normal((count, 3)).astype(np.float32),
+        terminated=generator.uniform(size=count) < 0.5,
+    )
+
+
+def test_a_row_has_room_for_every_number_of_a_transition():
+    assert LAYOUT.width == 3 + 2 + 1 + 3 + 1
+
+
+@pytest.mark.parametrize("to_array", [np.asarray, jax.numpy.asarray], ids=["numpy", "jax"])
+def test_unpacking_gives_back_what_was_packed_in_32_bits(to_array):
+    given = transitions(np.random.default_rng(0), 7)
+    rows = LAYOUT.pack(given)
+    assert (rows.shape, rows.dtype) == ((7, LAYOUT.width), np.float32)
+    batch = LAYOUT.unpack(to_array(rows))
+    for name, column in given._asdict().items():
+        unpacked = getattr(batch, name)
+        assert unpacked.dtype == np.float32
+        assert unpacked.shape == column.shape
+        np.testing.assert_array_equal(unpacked, column.astype(np.float32), err_msg=name)
+
+
+def test_a_drawn_batch_is_in_32_bits():
+    buffer = ReplayBuffer(10, LAYOUT)
+    buffer.add(transitions(np.random.default_rng(0), 4))
+    rows = buffer.sample(np.random.default_rng(0), 6)
+    assert (rows.shape, rows.dtype) == ((6, LAYOUT.width), np.float32)
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 7])
+def test_the_buffer_holds_exactly_the_last_transitions(at_once):
+    generator, buffer, model = np.random.default_rng(0), ReplayBuffer(7, LAYOUT), []
+    for _ in range(40 // at_once):
+        some = transitions(generator, at_once)
+        buffer.add(some)
+        model = (model + LAYOUT.pack(some).tolist())[-7:]
+        assert buffer.size == len(model)
+        assert sorted(buffer.rows[: buffer.size].tolist()) == sorted(model)
+    assert buffer.added == 40 // at_once * at_once
+
+
+def test_transition_number_n_lies_in_row_n_modulo_the_capacity():
+    buffer, everything = ReplayBuffer(5, LAYOUT), transitions(np.random.default_rng(0), 12)
+    for start in range(0, 12, 2):
+        buffer.add(Transitions(*(column[start : start + 2] for column in everything)))
+    np.testing.assert_array_equal(buffer.rows, LAYOUT.pack(everything)[[10, 11, 7, 8, 9]])
+
+
+def numbered(capacity: int, added: int) -> ReplayBuffer:
+    """A buffer whose rewards are the transitions' numbers."""
+    layout = RowLayout(1, 1)
+    buffer = ReplayBuffer(capacity, layout)
+    column = np.zeros((1, 1), np.float32)
+    for number in range(added):
+        buffer.add(Transitions(column, column, np.array([number], np.float32), column, np.array([False])))
+    return buffer
+
+
+@pytest.mark.parametrize(("added", "held"), [(12, range(12)), (20, range(20)), (33, range(13, 33))])
+def test_every_transition_held_is_drawn_equally_often_and_no_other(added, held):
+    buffer = numbered(20, added)
+    drawn = buffer.layout.unpack(buffer.sample(np.random.default_rng(1), 40_000)).reward
+    numbers, counts = np.unique(drawn, return_counts=True)
+    assert numbers.tolist() == list(held)
+    assert chisquare(counts).pvalue > 0.01
+
+
+def test_draws_are_independent_of_each_other():
+    """With replacement, and pairs of neighbours in a batch are as frequent as chance has it."""
+    buffer = numbered(4, 4)
+    drawn = buffer.layout.unpack(buffer.sample(np.random.default_rng(2), 40_000)).reward.astype(int)
+    pairs = np.bincount(4 * drawn[:-1] + drawn[1:], minlength=16)
+    assert chisquare(pairs).pvalue > 0.01
+
+
+def test_the_same_generator_draws_the_same_batch():
+    buffer = numbered(20, 33)
+    first, second = (buffer.sample(np.random.default_rng(3), 8) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_a_drawn_batch_does_not_change_when_its_rows_are_overwritten():
+    buffer = numbered(4, 4)
+    rows = buffer.sample(np.random.default_rng(0), 8)
+    kept = rows.copy()
+    buffer.rows[:] = -1
+    np.testing.assert_array_equal(rows, kept)
+
+
+def test_a_buffer_that_does_not_fit_is_refused_with_its_size_and_one_that_does(monkeypatch):
+    monkeypatch.setattr(replay, "available_memory", lambda: 2**30)
+    layout = RowLayout(376, 17)  # Humanoid-v4: 771 numbers
+    require_memory(348_000, layout)  # 348000 · 771 · 4 = 0.9995 GiB
+    with pytest.raises(SettingError, match=r"replay_capacity = 1000000: .*771 numbers take 2\.87 GiB.*1\.00 GiB") as e:
+        require_memory(1_000_000, layout)
+    advised = int(str(e.value).split("--replay-capacity ")[1].split()[0])
+    assert 200_000 < advised < 348_000
+    require_memory(advised, layout)
+
+
+def test_several_runs_at_once_need_several_buffers(monkeypatch):
+    monkeypatch.setattr(replay, "available_memory", lambda: 2**30)
+    layout = RowLayout(376, 17)
+    with pytest.raises(SettingError, match=r"in each of 3 runs at once.*or fewer --workers"):
+        require_memory(200_000, layout, runs_at_once=3)
+    require_memory(200_000, layout)
+
+
+def test_a_system_that_does_not_tell_its_memory_refuses_nothing(monkeypatch):
+    monkeypatch.setattr(replay, "available_memory", lambda: None)
+    require_memory(10**12, LAYOUT)
+
+
+def test_this_machine_has_some_memory_left():
+    available = available_memory()
+    assert available is None or 2**20 < available < 2**50

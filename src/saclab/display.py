@@ -82,6 +82,8 @@ def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[event
                         + f"  ({meter.rate:.0f} updates/s, {duration(meter.seconds_left)} left)",
                         soft_wrap=True,
                     )
+                case events.Warned():
+                    console.print(f"warning: {escape(event.message)}", soft_wrap=True)
                 case events.Finished():
                     console.print(
                         f"finished: {event.reason}; {event.steps:,} steps, {event.updates:,} updates, "

@@ -25,6 +25,10 @@ class TrainingFailed(RuntimeError):  # noqa: N818 - it names what happened
     """A run cannot go on; what it had saved is kept. The command line exits with status 1."""
 
 
+class NonFiniteError(TrainingFailed):
+    """An environment or an update gave a number that is not finite."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a name that is not among the known ones; suggests the nearest."""
     known = sorted(known)

@@ -9,7 +9,7 @@ import numpy as np
 
 from saclab.environments.make import environment_spec, make_environment
 from saclab.environments.simulator import capture_state, restore_state
-from saclab.errors import TrainingFailed
+from saclab.errors import NonFiniteError
 
 
 class Transitions(NamedTuple):
@@ -32,10 +32,6 @@ class EndedEpisode(NamedTuple):
     total_reward: float
     length: int
     terminated: bool
-
-
-class NonFiniteError(TrainingFailed):
-    """An environment gave an observation or a reward that is not a finite number."""
 
 
 class TrainingEnvironments:

@@ -54,6 +54,12 @@ class Evaluated(NamedTuple):
     """Whether its mean is the run's best so far."""
 
 
+class Warned(NamedTuple):
+    """Something looks wrong; told once."""
+
+    message: str
+
+
 class Saved(NamedTuple):
     checkpoint: Path
     seconds: float
@@ -75,4 +81,4 @@ class Interrupted(NamedTuple):
     steps: int
 
 
-Event = Started | Progress | EpisodeEnded | UpdatesLogged | Evaluated | Saved | Finished | Interrupted
+Event = Started | Progress | EpisodeEnded | UpdatesLogged | Evaluated | Warned | Saved | Finished | Interrupted

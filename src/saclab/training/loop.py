@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import json
 import os
@@ -11,10 +12,13 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+import safetensors.numpy
+
 from saclab.algorithm.types import Metrics
 from saclab.config import Config
 from saclab.environments.vector import EndedEpisode
-from saclab.errors import UserError
+from saclab.errors import NonFiniteError, TrainingFailed, UserError
 from saclab.trained_policy import save_policy
 from saclab.training.checkpoint import load_newest_checkpoint, save_checkpoint
 from saclab.training.events import (
@@ -27,12 +31,15 @@ from saclab.training.events import (
     Saved,
     Started,
     UpdatesLogged,
+    Warned,
 )
 from saclab.training.requests import Requests
-from saclab.training.run import Run
+from saclab.training.run import Run, named_leaves
 from saclab.training.run_folder import FORMAT, Logs, is_finished, machine_facts, read_config_file, write_json
 
 PROGRESS_SECONDS = 0.25
+SANE_TEMPERATURES = (1e-5, 100.0)
+RECENT_ROWS = 1000  # transitions left for a look at a failure
 
 
 def train(
@@ -59,6 +66,14 @@ def train(
             session = Session(run, folder, requests or Requests(), checkpoint_minutes)
             try:
                 yield from session.events()
+            except NonFiniteError as error:
+                write_failure(folder, run)
+                raise NonFiniteError(f"{error}. What led to it lies in {folder / 'failure'}") from error
+            except OSError as error:
+                raise TrainingFailed(
+                    f"cannot write to {folder}: {error.strerror}; its last checkpoint is kept: make room, then "
+                    f"continue with: saclab resume {folder}"
+                ) from error
             finally:
                 session.logs.close()
     finally:
@@ -73,6 +88,7 @@ class Session:
         config = run.config
         self.checkpoint_seconds = 60 * checkpoint_minutes
         self.notes = [ratio_note(config)]
+        self.warned_of_temperature = False
         new = not (folder / "config.json").exists()
         if not new:
             require_same_config(folder, config)
@@ -137,6 +153,23 @@ class Session:
         means = dict(zip(Metrics._fields, values.tolist(), strict=True))
         self.logs.metrics({"updates": counters.updates, "steps": counters.steps, **means, "seconds": self._seconds()})
         yield UpdatesLogged(counters.steps, counters.updates, means)
+        yield from self._watch_temperature(means["temperature"])
+
+    def _watch_temperature(self, temperature: float) -> Iterator[Event]:
+        """Warn once of a learned temperature that explodes or collapses."""
+        low, high = SANE_TEMPERATURES
+        if self.warned_of_temperature or self.run.config.algorithm.temperature == "fixed" or low < temperature < high:
+            return
+        self.warned_of_temperature = True
+        advice = (
+            "the policy cannot reach the target entropy: lower --target-entropy"
+            if temperature >= high
+            else "the policy stays above the target entropy without any bonus: raise --target-entropy"
+        )
+        yield Warned(
+            f"the temperature is {temperature:.3g}, outside {low:g} to {high:g}: {advice}, or lower "
+            "--temperature-learning-rate, or scale the environment's rewards"
+        )
 
     def _evaluate(self) -> Evaluated:
         run, counters = self.run, self.run.counters
@@ -234,6 +267,19 @@ def ratio_note(config: Config) -> str:
             "each time all of them have been stepped"
         )
     return note
+
+
+def write_failure(folder: Path, run: Run) -> None:
+    """Leave what is needed to look at a run that met a number that is not finite, in `folder`/failure."""
+    failure = folder / "failure"
+    failure.mkdir(exist_ok=True)
+    write_json(failure / "counters.json", dataclasses.asdict(run.counters))
+    recent = np.arange(run.replay.added - min(RECENT_ROWS, run.replay.size), run.replay.added) % run.replay.capacity
+    arrays = {name: np.array(leaf) for name, leaf in named_leaves(run.learner_state).items()}
+    arrays |= {"recent_transitions": run.replay.rows[recent], "observation": run.environments.observation}
+    if run.window:
+        arrays["metrics"] = np.stack([np.asarray(values) for values in run.window])
+    safetensors.numpy.save_file(arrays, failure / "state.safetensors")
 
 
 def require_same_config(folder: Path, config: Config) -> None:

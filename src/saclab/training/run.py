@@ -16,17 +16,13 @@ from saclab.algorithm.learner import make_learner
 from saclab.algorithm.types import LearnerState, Metrics
 from saclab.config import AlgorithmSettings, Config
 from saclab.environments.vector import EndedEpisode, TrainingEnvironments
-from saclab.errors import TrainingFailed
+from saclab.errors import NonFiniteError
 from saclab.replay import ReplayBuffer, RowLayout, require_memory
 from saclab.training import seeds
 from saclab.training.checkpoint import Arrays, Checkpoint
 from saclab.training.evaluation import EvaluationEpisodes, Evaluator
 
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
-
-
-class NonFiniteUpdate(TrainingFailed):
-    """An update gave a loss, a temperature or a value that is not a finite number."""
 
 
 @dataclass
@@ -182,7 +178,7 @@ class Run:
         """The window's metrics f32[updates, M].
 
         Raises:
-            NonFiniteUpdate: names the first update and the metrics that are not finite.
+            NonFiniteError: names the first update and the metrics that are not finite.
         """
         if not self.window:
             return np.zeros((0, len(Metrics._fields)), np.float32)
@@ -191,17 +187,25 @@ class Run:
         if broken.any():
             first = int(np.flatnonzero(broken.any(axis=1))[0])
             names = [name for name, bad in zip(Metrics._fields, broken[first], strict=True) if bad]
-            raise NonFiniteUpdate(
+            raise NonFiniteError(
                 f"update {self.counters.updates - len(values) + first + 1} gave a value that is not finite in "
                 f"{', '.join(names)}: lower the learning rates, or look at the scale of the environment's rewards"
             )
         return values
 
     def capture(self) -> Checkpoint:
-        """Everything but the replay buffer, which the checkpoint takes from `self.replay`."""
+        """Everything but the replay buffer, which the checkpoint takes from `self.replay`.
+
+        Raises:
+            NonFiniteError: if it is not worth continuing from.
+        """
+        learner = {name: np.asarray(leaf) for name, leaf in named_leaves(self.learner_state).items()}
+        for name, array in learner.items():
+            if np.isnan(array).any():
+                raise NonFiniteError(f"after update {self.counters.updates} {name} is not finite")
         environment_arrays, environment_states = split_arrays(self.environments.capture())
         groups: dict[str, Arrays] = {
-            "learner": {name: np.asarray(leaf) for name, leaf in named_leaves(self.learner_state).items()},
+            "learner": learner,
             "environments": environment_arrays,
             "window": {"metrics": self.window_array()},
         }

@@ -1,0 +1,237 @@
+"""Every command as a user runs it, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SMALL = ("--random-steps", "200", "--batch-size", "32", "--hidden-layers", "16", "16", "--evaluation-episodes", "2")
+SHORT = (*SMALL, "--max-updates", "300", "--evaluation-interval-steps", "250", "--log-interval", "50")
+
+
+def saclab(*arguments: str, folder: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    """Run a command in `folder`, one core, and no terminal."""
+    return subprocess.run(
+        [sys.executable, "-m", "saclab", *arguments], cwd=folder, capture_output=True, text=True, timeout=timeout
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which a short comparison of two variants on Pendulum-v1 has been run."""
+    folder = tmp_path_factory.mktemp("compared")
+    result = saclab(
+        "compare", "Pendulum-v1", "--variants", "sac", "averaged", "--protocol", "quick", "--seeds", "2", *SHORT,
+        folder=folder,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    return folder
+
+
+def run_folder(folder: Path, variant: str = "sac", seed: int = 0) -> Path:
+    return folder / "runs" / "Pendulum-v1" / variant / "quick" / f"seed-{seed}"
+
+
+def test_compare_trains_the_grid_and_writes_the_report(trained: Path) -> None:
+    for variant in ("sac", "averaged"):
+        for seed in (0, 1):
+            result = json.loads((run_folder(trained, variant, seed) / "result.json").read_text())
+            assert result["updates"] == 300
+    page = trained / "runs" / "report" / "index.html"
+    assert "Pendulum-v1" in page.read_text()
+
+
+def test_compare_again_skips_what_is_finished(trained: Path) -> None:
+    before = (run_folder(trained) / "evaluations.csv").stat().st_mtime_ns
+    result = saclab(
+        "compare", "Pendulum-v1", "--variants", "sac", "averaged", "--protocol", "quick", "--seeds", "2", *SHORT,
+        folder=trained,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert (run_folder(trained) / "evaluations.csv").stat().st_mtime_ns == before
+
+
+def test_settings_given_to_compare_reach_every_run_and_the_others_keep_their_variant(trained: Path) -> None:
+    configs = [json.loads((run_folder(trained, v) / "config.json").read_text())["config"] for v in ("sac", "averaged")]
+    assert [config["algorithm"]["batch_size"] for config in configs] == [32, 32]
+    assert [config["algorithm"]["snapshots"] for config in configs] == [1, 10]
+
+
+def test_evaluate_prints_the_return_of_the_best_policy(trained: Path) -> None:
+    result = saclab("evaluate", str(run_folder(trained)), "--episodes", "3", "--json", folder=trained)
+    assert result.returncode == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert len(told["total_rewards"]) == 3
+    assert told["mean_return"] == pytest.approx(np.mean(told["total_rewards"]))
+
+
+def test_report_reads_run_folders(trained: Path) -> None:
+    result = saclab("report", "runs", "--out", "elsewhere", folder=trained)
+    assert result.returncode == 0, result.stderr
+    assert (trained / "elsewhere" / "index.html").is_file()
+
+
+def test_variants_and_protocols_are_listed(tmp_path: Path) -> None:
+    variants = saclab("variants", folder=tmp_path).stdout
+    assert all(name in variants for name in ("sac", "sac-auto", "averaged", "averaged-auto", "averaged-entropy"))
+    protocols = saclab("protocols", folder=tmp_path).stdout
+    assert all(name in protocols for name in ("paper", "standard", "quick"))
+
+
+def test_help_shows_the_values_of_the_variant_and_protocol_named(tmp_path: Path) -> None:
+    told = saclab("train", "Humanoid-v4", "--variant", "averaged", "--protocol", "paper", "--help", folder=tmp_path)
+    assert told.returncode == 0
+    words = " ".join(told.stdout.replace("│", " ").split())
+    assert "(default: 1500000)" in words
+    assert "initial-temperature FLOAT α, or its first value if it is learned. (default: 0.1)" in words
+
+
+def test_settings_follow_the_environment_wherever_it_stands_on_the_line(tmp_path: Path) -> None:
+    told = saclab(
+        "train", "--seed", "3", "Humanoid-v4", "--protocol", "paper", "--variant", "sac", "--max-updates", "1",
+        "--random-steps", "256", "--evaluation-episodes", "1", "--hidden-layers", "8", folder=tmp_path,
+    )  # fmt: skip
+    assert told.returncode == 0, told.stderr
+    config = json.loads((tmp_path / "runs/Humanoid-v4/sac/paper/seed-3/config.json").read_text())["config"]
+    assert config["algorithm"]["initial_temperature"] == 0.1
+    assert config["training"]["patience_episodes"] == 750
+
+
+def test_train_stops_on_ctrl_c_and_resume_ends_as_if_nothing_had_happened(tmp_path: Path) -> None:
+    arguments = ["Pendulum-v1", "--protocol", "quick", *SHORT, "--max-updates", "3000"]
+    straight = saclab("train", *arguments, "--runs", "straight", folder=tmp_path)
+    assert straight.returncode == 0, straight.stderr
+    process = subprocess.Popen(
+        [sys.executable, "-m", "saclab", "train", *arguments, "--runs", "stopped"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    stopped = tmp_path / "stopped/Pendulum-v1/sac-auto/quick/seed-0"
+    wait_for(lambda: (stopped / "metrics.jsonl").exists() and (stopped / "metrics.jsonl").stat().st_size > 0)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert f"saclab resume stopped/{stopped.relative_to(tmp_path / 'stopped')}" in output
+    assert not (stopped / "result.json").exists()
+    resumed = saclab("resume", str(stopped), folder=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
+    for name in ("evaluations.csv", "episodes.csv"):
+        assert without_seconds(stopped / name) == without_seconds(tmp_path / "straight" / stopped.relative_to(
+            tmp_path / "stopped") / name)  # fmt: skip
+
+
+def wait_for(condition: object, seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def without_seconds(path: Path) -> list[str]:
+    """Lines of a CSV without its last column, the wall-clock time."""
+    return [line.rpartition(",")[0] for line in path.read_text().splitlines()]
+
+
+def test_one_failed_run_does_not_sink_the_others(tmp_path: Path) -> None:
+    (tmp_path / "breaking.py").write_text(
+        """
+import gymnasium, numpy as np
+from gymnasium.spaces import Box
+
+class Breaking(gymnasium.Env):
+    observation_space = Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.broken = False
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        value = np.nan if self.np_random.random() < 1 / 300 else 0.0
+        return np.full(2, value, np.float32), 0.0, False, bool(self.np_random.random() < 0.05), {}
+
+gymnasium.register("Breaking-v0", Breaking)
+"""
+    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    result = subprocess.run(
+        [sys.executable, "-m", "saclab", "compare", "breaking:Breaking-v0", "Pendulum-v1", "--variants", "sac",
+         "--protocol", "quick", "--seeds", "1", *SHORT],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, env=environment,
+    )  # fmt: skip
+    assert result.returncode == 1, result.stderr
+    assert "not finite" in result.stdout
+    assert (run_folder(tmp_path) / "result.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("train", "HalfCheeta-v4"), "did you mean 'HalfCheetah"),
+        (("train", "Pendulum-v1", "--variant", "averagd"), "did you mean 'averaged'"),
+        (("train", "Pendulum-v1", "--protocol", "papper"), "did you mean 'paper'"),
+        (("train", "Pendulum-v1", "--snapshot", "3"), "--snapshots"),
+        (("train", "CartPole-v1"), "actions are discrete"),
+        (("train", "Pendulum-v1", "--snapshots", "0"), "snapshots = 0"),
+        (("train", "Pendulum-v1", "--random-steps", "100"), "--batch-size 100 or less"),
+        (("train", "Pendulum-v1", "--replay-capacity", "900000000000"), "GiB"),
+        (("train", "Pendulum-v1", "--environment-arguments", "{wrong"), "not JSON"),
+        (("train", "Pendulum-v1", "--environment-arguments", '{"wrong": 1}'), "does not accept"),
+        (("train", "no_such_package:Thing-v0"), "no_such_package"),
+        (("resume", "nowhere"), "not a run folder"),
+        (("evaluate", "nowhere"), "no policy"),
+        (("report", "nowhere"), "no run folder"),
+        (("compare", "Pendulum-v1", "--variants", "sac", "nonsense"), "unknown variant 'nonsense'"),
+        (("compare", "Pendulum-v1", "--seeds", "0"), "seeds = 0"),
+    ],
+)
+def test_bad_input_gets_a_clear_line_and_status_2(tmp_path: Path, arguments: tuple[str, ...], expected: str) -> None:
+    result = saclab(*arguments, folder=tmp_path)
+    assert result.returncode == 2
+    assert expected in result.stderr + result.stdout
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "runs").exists(), "nothing may be left behind"
+
+
+def test_a_folder_with_other_settings_is_refused_and_kept(trained: Path) -> None:
+    before = (run_folder(trained) / "config.json").read_bytes()
+    result = saclab(
+        "train", "Pendulum-v1", "--variant", "sac", "--protocol", "quick", *SHORT, "--discount", "0.9", folder=trained
+    )
+    assert result.returncode == 2
+    assert "discount is 0.99 there, 0.9 here" in result.stderr
+    assert (run_folder(trained) / "config.json").read_bytes() == before
+
+
+def test_a_run_in_use_is_refused_with_the_other_process_id(tmp_path: Path) -> None:
+    arguments = ("train", "Pendulum-v1", "--protocol", "quick", *SMALL, "--max-updates", "1000000")
+    first = subprocess.Popen(
+        [sys.executable, "-m", "saclab", *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        lock = tmp_path / "runs/Pendulum-v1/sac-auto/quick/seed-0/lock"
+        wait_for(lambda: lock.exists() and lock.read_text() == str(first.pid))
+        second = saclab(*arguments, folder=tmp_path)
+    finally:
+        first.kill()
+        first.wait()
+    assert second.returncode == 2
+    assert f"in use by process {first.pid}" in second.stderr
+
+
+def test_the_terminal_stays_clean_and_no_stray_file_is_left(tmp_path: Path) -> None:
+    result = saclab(
+        "train", "HalfCheetah-v4", "--protocol", "quick", *SMALL, "--max-updates", "20", "--evaluation-episodes", "1",
+        folder=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 0
+    assert result.stderr == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]

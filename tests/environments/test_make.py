@@ -84,7 +84,8 @@ def test_making_a_v4_environment_leaves_no_file_and_no_word_on_the_terminal(tmp_
     script = """
 import numpy as np
 from saclab.environments.make import make_environment
-from saclab.environments.vector import NonFiniteError, TrainingEnvironments
+from saclab.environments.vector import TrainingEnvironments
+from saclab.errors import NonFiniteError
 make_environment("HalfCheetah-v4").reset(seed=0)
 environments = TrainingEnvironments("HalfCheetah-v4", {}, [0])
 data = environments.environments[0].unwrapped.data

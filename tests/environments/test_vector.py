@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from saclab.environments.make import EnvironmentSpec
-from saclab.environments.vector import NonFiniteError, TrainingEnvironments
+from saclab.environments.vector import TrainingEnvironments
+from saclab.errors import NonFiniteError
 
 from .tiny import TIME_LIMIT
 

@@ -219,8 +219,15 @@ def draw_pairs(pairs: Sequence[Pair], title: str) -> Figure | None:
         for i, j, estimate, bounds in ((row, column, p, (low, high)), (column, row, 1 - p, (1 - high, 1 - low))):
             matrix[i, j] = estimate
             text = f"{estimate:.2f}\n" + ("no interval" if np.isnan(low) else f"[{bounds[0]:.2f}, {bounds[1]:.2f}]")
-            clear = bounds[0] > 0.5 or bounds[1] < 0.5
-            panel.text(j, i, text, ha="center", va="center", fontsize=9, fontweight="bold" if clear else "normal")
+            panel.text(
+                j,
+                i,
+                text,
+                ha="center",
+                va="center",
+                fontsize=9,
+                fontweight="bold" if pair.improvement.decided else "normal",
+            )
     panel.imshow(matrix, cmap=matplotlib.colormaps["PuOr"], vmin=-0.3, vmax=1.3)
     names = ["\n".join(textwrap.wrap(arm.title, 16)) for arm in arms]
     panel.set_xticks(range(len(arms)), names)

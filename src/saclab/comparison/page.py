@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Sequence
 from html import escape
 from importlib import resources
@@ -21,8 +22,8 @@ from saclab.comparison.scores import (
     AggregateScores,
     EnvironmentScores,
     Pair,
+    aggregate_sentences,
     environment_sentences,
-    interval_text,
 )
 from saclab.comparison.tables import Table, runs_table, scores_table, settings_table, versions_table
 from saclab.paper import CURVE_ACCURACY, SOURCE
@@ -89,15 +90,12 @@ def summary(scores: Sequence[EnvironmentScores], together: AggregateScores | Non
     for entry in scores:
         parts.append(f"<h3>{escape(shown(entry.environment))}</h3>{bullets(environment_sentences(entry))}")
     if together is not None:
-        sentences = [pair.sentence for pair in together.pairs]
-        sentences += [f"{entry.arm.name}: normalised final test return {interval_text(entry.interquartile_mean)}."
-                      for entry in together.arms]  # fmt: skip
-        parts.append(f"<h3>All environments together</h3>{bullets(sentences)}")
+        parts.append(f"<h3>All environments together</h3>{bullets(aggregate_sentences(together))}")
     return f'<section id="summary"><h2>Summary</h2>{"".join(parts)}</section>'
 
 
 def bullets(sentences: Sequence[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(sentence)}</li>' for sentence in sentences)}</ul>"
+    return f"<ul>{''.join(f'<li>{unbroken(sentence)}</li>' for sentence in sentences)}</ul>"
 
 
 def environment_section(entry: EnvironmentScores, number: int) -> str:
@@ -132,12 +130,18 @@ def table_html(table: Table, headed: bool = False) -> str:
     rows = []
     for row in table.rows:
         first = f'<th scope="row">{escape(row[0])}</th>' if headed else f"<td>{escape(row[0])}</td>"
-        rows.append(f"<tr>{first}{''.join(f'<td>{escape(cell)}</td>' for cell in row[1:])}</tr>")
+        rest = "".join(f"<td>{unbroken(cell)}</td>" for cell in row[1:])
+        rows.append(f"<tr>{first}{rest}</tr>")
     note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
     return (
         f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(table.title)}"><table>'
         f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>{note}"
     )
+
+
+def unbroken(text: str) -> str:
+    """Escaped text whose intervals stay on one line."""
+    return re.sub(r"\[[^\]]{1,40}\]", lambda found: found[0].replace(" ", "\u00a0"), escape(text))
 
 
 def pairs_html(pairs: Sequence[Pair]) -> str:
@@ -168,14 +172,15 @@ def pair_cell(pair: Pair, flipped: bool) -> str:
     if flipped:
         p, low, high, runs_x, runs_y = 1 - p, 1 - high, 1 - low, runs_y, runs_x
         same_seed, same_low, same_high = 1 - same_seed, 1 - same_high, 1 - same_low
-    clear = low > 0.5 or high < 0.5
     bounds = f"[{low:.2f}, {high:.2f}]" if low == low else "no interval"
     seeds = f"{runs_x} against {runs_y} seeds"
     if count:
         paired_bounds = f" [{same_low:.2f}, {same_high:.2f}]" if same_low == same_low else ", no interval"
         seeds += f"; equal seeds {same_seed:.2f}{paired_bounds}, {count_text(count, 'pair')}"
     shade = f"shade-{min(9, int(10 * p))}"
-    return f'<td class="{shade}{" clear" * clear}">{p:.2f} {bounds}<small>{escape(seeds)}</small></td>'
+    return (
+        f'<td class="{shade}{" clear" * pair.improvement.decided}">{p:.2f} {bounds}<small>{escape(seeds)}</small></td>'
+    )
 
 
 def videos(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str:
@@ -213,8 +218,8 @@ def video_html(environment: str, arm: Arm, run: RunRecord, size: int, embed: boo
     )
     if not embed:
         place = escape(shown("/".join(run.path.parts[-4:]), 200))
-        return f"<figure><figcaption>{caption}. Too large to embed ({size / 1e6:.1f} MB): {place}/best/video.mp4"\
-               "</figcaption></figure>"  # fmt: skip
+        too_large = f"Too large to embed ({size / 1e6:.1f} MB): {place}/best/video.mp4"
+        return f"<figure><figcaption>{caption}. {too_large}</figcaption></figure>"
     content = base64.b64encode((run.path / "best" / "video.mp4").read_bytes()).decode()
     return (
         f'<figure><video controls muted loop playsinline preload="metadata" aria-label="{caption}" '

@@ -140,7 +140,7 @@ def band_data(band: Any) -> dict[str, Any]:
 
 def interval_data(interval: Interval) -> dict[str, Any]:
     estimate, low, high = numbers(np.array(interval[:3]))
-    return {"estimate": estimate, "low": low, "high": high}
+    return {"estimate": estimate, "low": low, "high": high, "count": interval.runs}
 
 
 def profile_data(

@@ -239,8 +239,9 @@ def environment_sentences(scores: EnvironmentScores) -> list[str]:
     tested = [arm for arm in scores.arms if arm.runs]
     if not tested:
         return ["No run has a test so far, so there is nothing to compare."]
-    sentences = [pair.sentence for pair in scores.pairs]
-    sentences += [f"{arm.arm.name}: final test return {interval_text(arm.final)}." for arm in tested]
+    sentences = pair_sentences(scores.pairs)
+    levels = "; ".join(f"{arm.arm.name} {interval_text(arm.final)}" for arm in tested)
+    sentences.append(f"Final test return: {levels}.")
     fewest = min(len(arm.runs) for arm in tested)
     if 1 < fewest < FEW_RUNS:
         sentences.append(
@@ -251,6 +252,17 @@ def environment_sentences(scores: EnvironmentScores) -> list[str]:
             f"All runs are scored up to {scores.horizon:,.0f} environment steps only, where the shortest one stands."
         )
     return sentences
+
+
+def aggregate_sentences(together: AggregateScores) -> list[str]:
+    """The summary of all environments together."""
+    levels = "; ".join(f"{entry.arm.name} {interval_text(entry.interquartile_mean)}" for entry in together.arms)
+    return [*pair_sentences(together.pairs), f"Normalised final test return: {levels.replace(' seeds', ' runs')}."]
+
+
+def pair_sentences(pairs: Sequence[Pair]) -> list[str]:
+    """Decided pairs first."""
+    return [pair.sentence for pair in sorted(pairs, key=lambda pair: not pair.improvement.decided)]
 
 
 def interval_text(interval: Interval) -> str:

@@ -62,6 +62,11 @@ class Improvement(NamedTuple):
     paired: Interval
     """The same over runs of equal seed only; `runs` counts the pairs, NaN if there is none."""
 
+    @property
+    def decided(self) -> bool:
+        """Whether the interval excludes ½."""
+        return self.low > 0.5 or self.high < 0.5
+
 
 def interquartile_mean(values: np.ndarray, axis: int = 0) -> np.ndarray:
     """Mean of the middle half (25 % trimmed mean, Agarwal et al. 2021); equals the mean of fewer than 4 values."""

@@ -34,11 +34,11 @@
     ? Math.round(value).toLocaleString("en") : `${+value.toPrecision(4)}`);
 
   function ticks(low, high, count) {
-    const rough = (high - low) / Math.max(1, count);
-    const power = 10 ** Math.floor(Math.log10(rough));
-    const step = [1, 2, 5, 10].map((factor) => factor * power).find((candidate) => candidate >= rough);
+    const rough = (high - low) / Math.max(1, count), power = 10 ** Math.floor(Math.log10(rough));
+    const away = (factor) => Math.abs(Math.log((factor * power) / rough));
+    const step = power * [1, 2, 2.5, 5, 10].reduce((a, b) => (away(b) < away(a) ? b : a));
     const values = [];
-    for (let value = Math.ceil(low / step) * step; value <= high + step * 1e-9; value += step) values.push(+value.toPrecision(12));
+    for (let i = Math.ceil(low / step); i * step <= high; i += 1) values.push(+(i * step).toPrecision(12));
     return values;
   }
 
@@ -84,7 +84,7 @@
       group.append(svg("line", { class: "grid", x1: box.left, x2: width - box.right, y1: scaleY(value), y2: scaleY(value) }),
         svg("text", { x: box.left - 6, y: scaleY(value) + 4, "text-anchor": "end" }, short(value)));
     }
-    for (const value of ticks(...rangeX, width / 80)) {
+    for (const value of ticks(...rangeX, width / 70)) {
       group.append(svg("line", { class: "grid", x1: scaleX(value), x2: scaleX(value), y1: height - box.bottom, y2: height - box.bottom + 4 }),
         svg("text", { x: scaleX(value), y: height - box.bottom + 16, "text-anchor": "middle" }, short(value)));
     }
@@ -95,7 +95,7 @@
   /* A chart of lines. `arms`: [{arm, count, x, middle, low, high, runs: [{seed, x, y}]}], `paper`: [{title, arm, x, y}]. */
   function lineChart(figure, chart) {
     const width = Math.max(260, figure.clientWidth - 20), height = Math.round(Math.min(300, Math.max(210, width * 0.62)));
-    const box = { left: 48, right: 10, top: 8, bottom: 36 };
+    const box = { left: 48, right: 18, top: 8, bottom: 36 };
     const lines = chart.arms.flatMap((arm) => [[arm.x, arm.middle], ...arm.runs.map((run) => [run.x, run.y])]);
     const rangeX = extent(lines.map((line) => line[0]));
     const paper = rangeX ? chart.paper.map((line) => {
@@ -182,31 +182,26 @@
   /* One row per arm: a point, its interval as a bar, its runs as ticks, the paper's number as a diamond. */
   function intervalChart(figure, chart) {
     const rows = chart.rows.filter((row) => state.arms.has(row.arm));
-    figure.querySelectorAll("svg, .empty").forEach((node) => node.remove());
+    figure.querySelectorAll(".row, svg, .empty").forEach((node) => node.remove());
     const known = rows.map((row) => [row.estimate, row.low, row.high, row.paper, ...row.runs].filter((value) => value !== null && value !== undefined));
-    let range = extent(known);
+    const range = extent(known);
     if (!range) { figure.append(html("p", { class: "empty note" }, "Nothing to show.")); return; }
-    const room = (range[1] - range[0]) * 0.06;
-    range = [range[0] - room, range[1] + room];
-    const width = Math.max(260, figure.clientWidth - 20), height = 44 * rows.length + 30;
-    const scale = (value) => 12 + ((value - range[0]) / (range[1] - range[0])) * (width - 24);
-    const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${chart.title}, by variant` });
-    for (const value of ticks(...range, width / 80)) {
-      picture.append(svg("line", { class: "grid", x1: scale(value), x2: scale(value), y1: 4, y2: height - 22 }),
-        svg("text", { x: scale(value), y: height - 6, "text-anchor": "middle" }, short(value)));
-    }
-    rows.forEach((row, place) => {
-      const y = 44 * place + 32;
+    const width = Math.max(260, figure.clientWidth - 20), room = (range[1] - range[0]) * 0.04;
+    const scale = (value) => 12 + ((value - range[0] + room) / (range[1] - range[0] + 2 * room)) * (width - 24);
+    const marks = ticks(...range, width / 70);
+    const strip = (height, ...nodes) => svg("svg", { viewBox: `0 0 ${width} ${height}`, "aria-hidden": "true" },
+      ...marks.map((value) => svg("line", { class: "grid", x1: scale(value), x2: scale(value), y1: 0, y2: 22 })), ...nodes);
+    for (const row of rows) {
+      const nodes = [];
+      if (row.low !== null) nodes.push(svg("line", { class: `bar ${colour(row.arm)}`, x1: scale(row.low), x2: scale(row.high), y1: 11, y2: 11 }));
+      for (const run of row.runs) nodes.push(svg("line", { class: "tick", x1: scale(run), x2: scale(run), y1: 5, y2: 17 }));
+      nodes.push(svg("path", { class: `marker ${colour(row.arm)}`, d: shape(row.arm), transform: `translate(${scale(row.estimate)} 11) scale(1.3)` }));
+      if (row.paper !== null) nodes.push(svg("path", { class: "reference", d: SHAPES[3], transform: `translate(${scale(row.paper)} 11) scale(1.3)` }));
       const interval = row.low === null ? "no interval" : `[${exact(row.low)}, ${exact(row.high)}]`;
-      const paper = row.paper === null ? "" : `; paper ${exact(row.paper)}`;
-      const count = row.runs.length ? `, n = ${row.runs.length}` : "";
-      picture.append(svg("text", { class: "name", x: 12, y: y - 14 }, `${data.arms[row.arm].title}: ${exact(row.estimate)} ${interval}${count}${paper}`));
-      if (row.low !== null) picture.append(svg("line", { class: `bar ${colour(row.arm)}`, x1: scale(row.low), x2: scale(row.high), y1: y, y2: y }));
-      for (const run of row.runs) picture.append(svg("line", { class: "tick", x1: scale(run), x2: scale(run), y1: y - 6, y2: y + 6 }));
-      picture.append(svg("path", { class: `marker ${colour(row.arm)}`, d: shape(row.arm), transform: `translate(${scale(row.estimate)} ${y}) scale(1.3)` }));
-      if (row.paper !== null) picture.append(svg("path", { class: "reference", d: SHAPES[3], transform: `translate(${scale(row.paper)} ${y}) scale(1.3)` }));
-    });
-    figure.append(picture);
+      const paper = row.paper === null ? "" : ` · ◇ paper ${exact(row.paper)}`;
+      figure.append(html("div", { class: "row" }, `${data.arms[row.arm].title}: ${exact(row.estimate)} ${interval}, n = ${row.count}${paper}`), strip(22, ...nodes));
+    }
+    figure.append(strip(24, ...marks.map((value) => svg("text", { x: scale(value), y: 16, "text-anchor": "middle" }, short(value)))));
   }
 
   function panelChart(panel) {

@@ -129,20 +129,17 @@ def grid_line(statuses: Sequence[RunStatus]) -> str:
 def grid_table(statuses: Sequence[RunStatus], rows: int) -> Table:
     """One line per run, the running ones first where not all fit."""
     table = Table(box=None, header_style="bold")
-    for title in ("environment", "variant", "seed"):
-        table.add_column(title, overflow="fold")
-    for title in ("state", "done", "updates", "updates/s", "left", "test return"):
-        table.add_column(title, justify="right")
+    table.add_column("run", overflow="fold")
+    for title in ("state", "done", "updates/s", "left", "test return"):
+        table.add_column(title, justify="right", no_wrap=True)
     order = {"running": 0, "failed": 1, "waiting": 2, "interrupted": 2, "finished": 3}
     shown = statuses if len(statuses) <= rows else sorted(statuses, key=lambda status: order[status.status])[:rows]
     colours = {"failed": "red", "running": "cyan", "finished": "green"}
     for status in shown:
-        config = status.cell.config
         table.add_row(
-            escape(config.environment), escape(config.variant), str(config.seed),
-            f"[{colours.get(status.status, 'default')}]{status.status}[/]",
-            f"{status.fraction:.0%}", f"{status.updates:,}", f"{status.updates_per_second:.0f}",
-            duration(status.seconds_left), number(status.test_return),
+            escape(run_name(status)), f"[{colours.get(status.status, 'default')}]{status.status}[/]",
+            f"{status.fraction:.0%}", f"{status.updates_per_second:.0f}", duration(status.seconds_left),
+            number(status.test_return),
         )  # fmt: skip
     if len(shown) < len(statuses):
         table.add_row(f"… and {len(statuses) - len(shown)} more")

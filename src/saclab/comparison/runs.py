@@ -18,7 +18,7 @@ import numpy as np
 
 from saclab.config import Config, TrainingSettings
 from saclab.errors import UserError
-from saclab.protocols import make_config, training_settings
+from saclab.protocols import PROTOCOLS, make_config, training_settings
 from saclab.training.run_folder import RunRecord, read_run
 from saclab.variants import VARIANTS
 
@@ -45,7 +45,9 @@ class Arm(NamedTuple):
 
     @property
     def suffix(self) -> str:
-        return f" ({', '.join(f'{name} {value}' for name, value in self.differs)})" if self.differs else ""
+        """The first differences in brackets; empty if there is none."""
+        listed = [f"{name} {value}" for name, value in self.differs[:3]] + ["…"] * (len(self.differs) > 3)
+        return f" ({', '.join(listed)})" if listed else ""
 
     @property
     def paper_name(self) -> str | None:
@@ -81,7 +83,8 @@ def shown(text: object, limit: int = 80) -> str:
 
 def read_comparison(folders: Sequence[Path], allow_mixed: bool = False) -> Comparison:
     """Read run folders and group them; raises UserError as `read_run` and `group_runs` do."""
-    return group_runs([read_run(folder) for folder in dict.fromkeys(folders)], allow_mixed)
+    once = {folder.resolve(): folder for folder in folders}
+    return group_runs([read_run(folder) for folder in once.values()], allow_mixed)
 
 
 def group_runs(runs: Sequence[RunRecord], allow_mixed: bool = False) -> Comparison:
@@ -97,36 +100,40 @@ def group_runs(runs: Sequence[RunRecord], allow_mixed: bool = False) -> Comparis
     """
     if not runs:
         raise UserError("there is no run to compare")
+    runs = sorted(runs, key=lambda run: (run.config.seed, str(run.path)))
     references = {name: reference_run([run for run in runs if run.config.environment == name])
                   for name in sorted({run.config.environment for run in runs})}  # fmt: skip
-    mixed = [*environment_differences(references)]
+    mixed = environment_differences(references)
     groups: dict[tuple[str, Arm], dict[int, RunRecord]] = {}
-    for run in sorted(runs, key=lambda run: (run.config.seed, str(run.path))):
-        reference = references[run.config.environment]
-        differences = differing(run, reference)
-        mixed += [difference_sentence(name, here, run, there, reference) for name, (here, there) in differences.items()]
-        differs = tuple((shown(name), shown(here, 30)) for name, (here, _) in differences.items())
-        group = groups.setdefault((run.config.environment, Arm(run.config.variant, differs)), {})
-        same = group.setdefault(run.config.seed, run)
+    firsts: dict[tuple[str, str], RunRecord] = {}
+    for run in runs:
+        environment, variant = run.config.environment, run.config.variant
+        reference, first = references[environment], firsts.setdefault((environment, variant), run)
+        differences = differing(run, reference) | unknown_differing(run, first)
+        arm = Arm(variant, tuple((shown(name), shown(here, 30)) for name, (here, _) in differences.items()))
+        if differences and (environment, arm) not in groups:
+            mixed.append(difference_sentence(run, first if variant not in VARIANTS else reference, differences))
+        same = groups.setdefault((environment, arm), {}).setdefault(run.config.seed, run)
         if same is not run:
             raise UserError(
                 f"{shown(same.path, 300)} and {shown(run.path, 300)} are the same experiment with the same seed "
                 f"{run.config.seed}: leave one of them out, since they are not independent"
             )
     if mixed and not allow_mixed:
-        more = f" ({len(mixed) - 1} more differences)" if len(mixed) > 1 else ""
+        more = f" (and {len(mixed) - 1} more like it)" if len(mixed) > 1 else ""
         raise UserError(f"not comparable: {mixed[0]}{more}: report them apart, or allow mixed runs side by side")
     known = list(VARIANTS)
     arms = sorted({arm for _, arm in groups}, key=lambda arm: (
         known.index(arm.variant) if arm.variant in known else len(known), arm.variant, arm.differs))  # fmt: skip
     by_seed = {key: tuple(group[seed] for seed in sorted(group)) for key, group in groups.items()}
-    return Comparison(tuple(references), tuple(arms), by_seed, tuple(dict.fromkeys(mixed)))
+    return Comparison(tuple(references), tuple(arms), by_seed, tuple(mixed))
 
 
 def reference_run(runs: Sequence[RunRecord]) -> RunRecord:
-    """The run that most others are comparable with; the first of equals in the order of their paths."""
-    ordered = sorted(runs, key=lambda run: str(run.path))
-    return max(ordered, key=lambda run: sum(not differing(run, other) for other in ordered))
+    """The first of the runs that most others are comparable with."""
+    signatures = [repr(signature(run)) for run in runs]
+    (most, _), *_ = Counter(signatures).most_common(1)
+    return runs[signatures.index(most)]
 
 
 def signature(run: RunRecord) -> dict[str, Any]:
@@ -145,14 +152,13 @@ def signature(run: RunRecord) -> dict[str, Any]:
 def beside_variant(config: Config) -> dict[str, Any]:
     """Settings of the algorithm that are not the variant's own on this environment and protocol.
 
-    All of them for a variant or protocol that this version does not know: nothing tells which are its own.
+    None for a variant or protocol that this version does not know: nothing tells which are its own.
     """
-    algorithm = asdict(config.algorithm)
     try:
         own = asdict(make_config(config.environment, config.variant, config.protocol).algorithm)
     except UserError:
-        return algorithm
-    return {name: value for name, value in algorithm.items() if value != own[name]}
+        return {}
+    return {name: value for name, value in asdict(config.algorithm).items() if value != own[name]}
 
 
 def major(version: str | None) -> str:
@@ -162,17 +168,32 @@ def major(version: str | None) -> str:
 def differing(run: RunRecord, reference: RunRecord) -> dict[str, tuple[Any, Any]]:
     """Name -> (value here, value there), for what makes two runs of one environment not comparable."""
     here, there = signature(run), signature(reference)
-    settings_here, settings_there = asdict(run.config.algorithm), asdict(reference.config.algorithm)
+    own_here, own_there = asdict(run.config.algorithm), asdict(reference.config.algorithm)
     return {
-        name: (here.get(name, settings_here.get(name)), there.get(name, settings_there.get(name)))
+        name: (
+            here[name] if name in here else f"the variant's own {own_here[name]}",
+            there[name] if name in there else f"the variant's own {own_there[name]}",
+        )
         for name in here | there
         if name not in here or name not in there or here[name] != there[name]
     }
 
 
-def difference_sentence(name: str, here: object, run: RunRecord, there: object, reference: RunRecord) -> str:
+def unknown_differing(run: RunRecord, first: RunRecord) -> dict[str, tuple[Any, Any]]:
+    """The same for the algorithm's settings of two runs of one variant that this version does not know."""
+    if run.config.variant in VARIANTS and run.config.protocol in PROTOCOLS:
+        return {}
+    here, there = asdict(run.config.algorithm), asdict(first.config.algorithm)
+    return {name: (here[name], there[name]) for name in here if here[name] != there[name]}
+
+
+def difference_sentence(run: RunRecord, reference: RunRecord, differences: Mapping[str, tuple[Any, Any]]) -> str:
+    """The first difference with both values and both runs, and the names of the others."""
+    (name, (here, there)), *others = differences.items()
+    also = f" (and {', '.join(shown(other) for other, _ in others)})" if others else ""
     return (
         f"{shown(name)} is {shown(here)} in {shown(run.path, 300)} and {shown(there)} in {shown(reference.path, 300)}"
+        f"{also}"
     )
 
 
@@ -186,7 +207,8 @@ def environment_differences(references: Mapping[str, RunRecord]) -> list[str]:
             sentences.append(f"{versions} are different tasks")
     for run in references.values():
         if run.config.protocol != first.config.protocol:
-            sentences.append(difference_sentence("protocol", run.config.protocol, run, first.config.protocol, first))
+            difference = {"protocol": (run.config.protocol, first.config.protocol)}
+            sentences.append(difference_sentence(run, first, difference))
     return sentences
 
 

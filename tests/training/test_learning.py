@@ -1,0 +1,26 @@
+"""Real learning, judged over seeds: minutes, so marked slow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import saclab
+from saclab.variants import VARIANTS
+
+SOLVED = -200.0  # mean test return of Pendulum-v1 that counts as solved; a random policy has about -1200
+SEEDS = 2
+
+
+@pytest.mark.slow
+def test_every_variant_solves_pendulum_on_every_seed(tmp_path: Path) -> None:
+    result = saclab.compare(
+        ["Pendulum-v1"], list(VARIANTS), SEEDS, "quick", runs=tmp_path,
+        update_interval=1, random_steps=1000, hidden_layers=(64, 64), max_updates=5000,
+        evaluation_interval_steps=1000, evaluation_episodes=20,
+    )  # fmt: skip
+    assert not result.failed
+    final = {(run.config.variant, run.config.seed): float(run.evaluations["mean_return"][-1]) for run in result.runs}
+    assert len(final) == SEEDS * len(VARIANTS)
+    assert {key: value for key, value in final.items() if value <= SOLVED} == {}

@@ -1,0 +1,51 @@
+"""Known soft values through everything that a run is made of: environments, replay buffer and learner."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from environments import tiny
+
+from saclab.algorithm.networks import NETWORKS
+from saclab.protocols import make_config
+from saclab.training.run import Run
+
+DISCOUNT, ALPHA, REWARD = 0.6, 0.5, 2.0
+SETTINGS = {
+    "hidden_layers": (16,),
+    "batch_size": 32,
+    "discount": DISCOUNT,
+    "initial_temperature": ALPHA,
+    "polyak_rate": 0.05,
+    "critic_learning_rate": 5e-3,
+    "actor_learning_rate": 5e-3,
+    "random_steps": 50,
+    "replay_capacity": 500,
+    "max_steps": 1050,
+}
+
+
+@pytest.mark.parametrize(
+    ("terminal", "worth"),
+    [
+        (True, REWARD),
+        # The future goes on beyond the time limit; the best policy is uniform, of entropy log 2.
+        (False, REWARD / (1 - DISCOUNT) + DISCOUNT / (1 - DISCOUNT) * ALPHA * math.log(2)),
+    ],
+    ids=["terminated", "truncated"],
+)
+def test_a_constant_reward_is_worth_itself_before_a_terminal_state_and_all_its_future_before_a_time_limit(
+    terminal, worth
+):
+    assert tiny.TIME_LIMIT == 5
+    run = Run(make_config("Constant-v0", "sac", environment_arguments={"terminal": terminal}, overrides=SETTINGS))
+    ends = []
+    while run.finish_reason() is None:
+        ends += run.step()
+    run.close()
+    assert {episode.terminated for episode in ends} == {terminal}
+    q = NETWORKS["mlp"](2, (16,), 1, "relu").apply
+    values = [q(critic, np.array([1.0, 0.3], np.float32))[0] for critic in np.asarray(run.learner_state.critic)]
+    assert values == pytest.approx([worth, worth], abs=0.1)

@@ -87,6 +87,7 @@ def save(figure: Figure | None, path: Path, said: Sequence[str]) -> list[Path]:
     FigureCanvasAgg(figure)
     for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
         figure.savefig(path.with_name(f"{path.name}.{suffix}"), dpi=150, metadata=metadata)
+        figure.set_layout_engine("none")  # the second file keeps the layout of the first, which is slow to find
     return [path.with_name(f"{path.name}.png")]
 
 

@@ -148,7 +148,8 @@ def probability_of_improvement(
     """P(X > Y), averaged over environments (Agarwal et al. 2021, Section 4.3), with a 95 % interval.
 
     The interval is the stratified bootstrap's, at each end never narrower than Newcombe's score interval: a bootstrap
-    of few runs is too narrow, and it vanishes altogether when every run of X scores above every run of Y.
+    of few runs is too narrow, and it vanishes altogether when every run of X scores above every run of Y. It includes ½
+    unless a permutation test rejects as well: with three runs each nothing can be significant.
 
     Args:
         x: scores f64[R_e] for each environment.
@@ -162,10 +163,29 @@ def probability_of_improvement(
     if min(fewest_x, fewest_y) < 2:
         return Improvement(estimate, np.nan, np.nan, fewest_x, fewest_y, paired)
     drawn = zip(resample(x), resample(y, seed=SEED + 1), strict=True)
-    low, high = percentiles(np.mean([win_share(a, b) for a, b in drawn], axis=0))
+    drawn_low, drawn_high = percentiles(np.mean([win_share(a, b) for a, b in drawn], axis=0))
     score = np.array([newcombe_interval(p, len(a), len(b)) for p, a, b in zip(shares, x, y, strict=True)])
     score_low, score_high = average_of_intervals(shares, score[:, 0], score[:, 1])
-    return Improvement(estimate, min(float(low), score_low), max(float(high), score_high), fewest_x, fewest_y, paired)
+    undecided = 0.5 if permutation_p_value(x, y) > 1 - CONFIDENCE else estimate
+    low, high = min(float(drawn_low), score_low, undecided), max(float(drawn_high), score_high, undecided)
+    return Improvement(estimate, low, high, fewest_x, fewest_y, paired)
+
+
+def permutation_p_value(x: Sequence[np.ndarray], y: Sequence[np.ndarray]) -> float:
+    """Two-sided p-value of the mean win share over environments, runs shuffled between X and Y within each.
+
+    The observed order counts as one of the shuffles, so that the test keeps its level.
+    """
+    generator = np.random.default_rng(SEED)
+
+    def shuffled(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        both = generator.permuted(np.tile(np.concatenate([a, b]), (RESAMPLES, 1)), axis=1)
+        return win_share(both[:, : len(a)], both[:, len(a) :])
+
+    strata = list(zip(x, y, strict=True))
+    observed = abs(np.mean([win_share(a, b) for a, b in strata]) - 0.5)
+    chance = np.abs(np.mean([shuffled(a, b) for a, b in strata], axis=0) - 0.5)
+    return float((1 + np.sum(chance >= observed - 1e-12)) / (1 + RESAMPLES))
 
 
 def newcombe_interval(share: float, runs_x: int, runs_y: int) -> tuple[float, float]:

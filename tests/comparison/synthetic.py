@@ -1,0 +1,89 @@
+"""Run folders without a training: made-up curves in the columns that run_folder itself defines."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from saclab.algorithm.types import Metrics
+from saclab.protocols import make_config
+from saclab.training.run_folder import EPISODE_COLUMNS, FORMAT, evaluation_columns, run_path
+
+VERSIONS = {"saclab": "0.1.0", "jax": "0.10.2", "gymnasium": "1.4.0", "mujoco": "4.0.0", "python": "3.11.9"}
+TEST_EPISODES = 20
+METRICS = Metrics._fields
+
+
+def write_run(
+    root: Path,
+    variant: str = "sac",
+    seed: int = 0,
+    environment: str = "HalfCheetah-v4",
+    protocol: str = "paper",
+    overrides: dict[str, Any] | None = None,
+    versions: dict[str, str] | None = None,
+    evaluations: int = 30,
+    level: float = 8000.0,
+    finished: bool = True,
+    metrics: tuple[str, ...] = METRICS,
+    rename: dict[str, Any] | None = None,
+    name: str | None = None,
+    returns: list[float] | None = None,
+) -> Path:
+    """Write one run and return its folder; `returns` are the test returns, else a noisy rise to about `level`."""
+    config = make_config(environment, variant, protocol, seed, overrides=overrides)
+    folder = run_path(root, config, name)
+    folder.mkdir(parents=True)
+    content = {
+        "format": FORMAT,
+        "config": config.to_dict() | (rename or {}),
+        "versions": VERSIONS | (versions or {}),
+        "machine": {"system": "Linux", "processor": "x86_64", "threads": 1},
+    }
+    (folder / "config.json").write_text(json.dumps(content))
+    generator = np.random.default_rng([seed, len(variant)])
+    count = evaluations if returns is None else len(returns)
+    curve = level * (1 - np.exp(-np.arange(10 * count + 10) / (3.0 * count + 3)))
+    curve = curve + generator.normal(0, 0.03 * abs(level), curve.shape) + generator.normal(0, 0.05 * abs(level))
+    write_evaluations(folder, generator, curve, count, returns)
+    write_episodes(folder, curve, 10 * count)
+    write_metrics(folder, generator, curve, 10 * count, metrics)
+    if finished:
+        (folder / "result.json").write_text(json.dumps({"reason": "max_updates"}))
+    return folder
+
+
+def write_evaluations(folder: Path, generator: Any, curve: np.ndarray, count: int, returns: list[float] | None) -> None:
+    with (folder / "evaluations.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(evaluation_columns(TEST_EPISODES))
+        for index in range(count):
+            episode = 10 * (index + 1)
+            each = curve[episode] + generator.normal(0, 100, TEST_EPISODES) if returns is None else returns[index]
+            each = np.broadcast_to(each, TEST_EPISODES)
+            writer.writerow([index + 1, 1000 * episode, 200 * episode, episode, each.mean(), *each,
+                             *[1000] * TEST_EPISODES, 2.0 * episode])  # fmt: skip
+
+
+def write_episodes(folder: Path, curve: np.ndarray, count: int) -> None:
+    average = 0.0
+    with (folder / "episodes.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(EPISODE_COLUMNS)
+        for episode in range(1, count + 1):
+            average = 0.8 * average + 0.2 * curve[episode]
+            writer.writerow([episode, 1000 * episode, 200 * episode, curve[episode], average, 1000, 0, 2.0 * episode])
+
+
+def write_metrics(folder: Path, generator: Any, curve: np.ndarray, count: int, names: tuple[str, ...]) -> None:
+    with (folder / "metrics.jsonl").open("w") as file:
+        for window in range(1, count + 1):
+            values = {name: float(generator.normal(1, 0.1)) for name in names}
+            if "actor_loss" in names:
+                values["actor_loss"] = -curve[window] / 10
+            file.write(json.dumps({"updates": 200 * window, "steps": 1000 * window, **values, "seconds": 2.0 * window}))
+            file.write("\n")

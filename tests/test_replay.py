@@ -87,12 +87,12 @@ def test_every_transition_held_is_drawn_equally_often_and_no_other(added, held):
     assert chisquare(counts).pvalue > 0.01
 
 
-def test_draws_are_independent_of_each_other():
-    """With replacement, and pairs of neighbours in a batch are as frequent as chance has it."""
-    buffer = numbered(4, 4)
-    drawn = buffer.layout.unpack(buffer.sample(np.random.default_rng(2), 40_000)).reward.astype(int)
-    pairs = np.bincount(4 * drawn[:-1] + drawn[1:], minlength=16)
-    assert chisquare(pairs).pvalue > 0.01
+def test_the_rows_of_a_batch_are_drawn_independently_of_each_other():
+    """As often all different as chance has it: 4! / 4⁴ of the batches of four out of four."""
+    buffer, generator = numbered(4, 4), np.random.default_rng(2)
+    batches = [buffer.layout.unpack(buffer.sample(generator, 4)).reward for _ in range(2000)]
+    different = sum(len(np.unique(batch)) == 4 for batch in batches)
+    assert chisquare([different, 2000 - different], [2000 * 24 / 256, 2000 * 232 / 256]).pvalue > 0.01
 
 
 def test_the_same_generator_draws_the_same_batch():

@@ -17,6 +17,8 @@ from saclab.training.run_folder import RunRecord, read_config, read_run, run_pat
 
 COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
 """The variants of a comparison, unless others are asked for."""
+Q_BIAS_EPISODES = 2
+"""With each test of `reproduce`: the paper's hypothesis is that averaging lowers the bias."""
 
 
 def train(
@@ -132,6 +134,56 @@ def compare(
 
         page = write_report(begun, Path(report) if report else Path(runs) / "report")
     return Comparison([read_run(folder) for folder in begun], failed, page, requests.stop)
+
+
+def reproduce(
+    environments: Sequence[str] = ("HalfCheetah-v4", "Humanoid-v4"),
+    variants: Sequence[str] = COMPARED,
+    seeds: int | Sequence[int] | None = None,
+    updates: int | None = None,
+    *,
+    workers: int | None = None,
+    runs: Path | str = "runs",
+    report: Path | str | None = None,
+    show: Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]] | None = None,
+    tell: Callable[[str], None] = print,
+    checkpoint_minutes: float = 10,
+) -> Comparison:
+    """The paper's experiment: a comparison under its protocol, with a forecast of the hours before it starts.
+
+    Args:
+        environments: Gymnasium ids.
+        variants: keys of `saclab.variants.VARIANTS`.
+        seeds: how many (0, 1, …) or which; None for the protocol's own number.
+        updates: fewer updates than the paper's; the report says that it is scaled down.
+        workers: runs at a time, one core each; None for one per core.
+        runs: the folder that holds all runs.
+        report: the report's folder; None for `runs`/report.
+        show: as in `compare`.
+        tell: takes the forecast.
+        checkpoint_minutes: wall-clock time between checkpoints.
+
+    Raises:
+        UserError: for a name or value that cannot work; nothing has been started then.
+    """
+    from saclab.comparison.forecast import forecast_hours
+
+    overrides: dict[str, Any] = {"q_bias_episodes": Q_BIAS_EPISODES}
+    if updates is not None:
+        overrides["max_updates"] = updates
+    cells = plan(environments, variants, seeds, "paper", runs, {}, overrides)
+    workers = workers or len(os.sched_getaffinity(0))
+    require_startable(cells, min(workers, len(cells)))
+    left = sum(not cell.finished for cell in cells)
+    if left:
+        tell(f"{left} of {len(cells)} runs to do; a few updates of each kind are measured to forecast the time …")
+        hours = forecast_hours(cells, workers, threads=1)
+        about = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.0f} minutes"
+        tell(f"forecast: about {about} with {workers} worker(s); stop at any time, the same command goes on")
+    return compare(
+        environments, variants, seeds, "paper", workers=workers, runs=runs, report=report, show=show,
+        checkpoint_minutes=checkpoint_minutes, **overrides,
+    )  # fmt: skip
 
 
 def plan(

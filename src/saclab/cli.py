@@ -17,7 +17,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, subcommand
 
 from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names
-from saclab.errors import SettingError, TrainingFailed, UserError
+from saclab.errors import NonFiniteError, SettingError, TrainingFailed, UserError
 from saclab.protocols import PROTOCOLS, make_config
 from saclab.variants import VARIANTS
 
@@ -56,6 +56,10 @@ class Train:
     """Takes the variant's place in the run folder's path, for runs with other settings."""
     threads: int | None = None
     """Cores that XLA uses; None for all. Results depend on it in the last bits."""
+    tensorboard: bool = False
+    """Write TensorBoard event files into the run folder; needs the extra `tensorboard`."""
+    wandb: str | None = None
+    """Send the run to this project of Weights & Biases; needs the extra `wandb`."""
     where: OmitArgPrefixes[Where] = field(default_factory=Where)
 
     def __call__(self, console: Console) -> int:
@@ -67,7 +71,7 @@ class Train:
             parse_arguments(self.where.environment_arguments),
         )  # fmt: skip
         folder = run_path(self.where.runs, config, self.name)
-        return train_and_show(config, folder, self.where.checkpoint_minutes, console)
+        return train_and_show(config, folder, self.where.checkpoint_minutes, console, self.tensorboard, self.wandb)
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,38 @@ class Compare:
             environment_arguments=parse_arguments(self.where.environment_arguments),
             show=lambda stream: display.show_grid(stream, console),
             checkpoint_minutes=self.where.checkpoint_minutes, **overrides,
+        )  # fmt: skip
+        return display.show_comparison(result, console)
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Run the paper's whole experiment and write its report: say first how long it will take, resume what has begun."""
+
+    environments: tuple[str, ...] = ("HalfCheetah-v4", "Humanoid-v4")
+    """Gymnasium ids."""
+    variants: tuple[str, ...] = ("sac", "sac-auto", "averaged", "averaged-auto")
+    """See `saclab variants`."""
+    seeds: int | None = None
+    """How many seeds; None for the protocol's own number."""
+    updates: int | None = None
+    """Fewer updates than the paper's; the report says that it is scaled down."""
+    workers: int | None = None
+    """Runs at a time, one core each; None for one per core."""
+    report: Path | None = None
+    """Folder of the report; None for report in the runs' folder."""
+    runs: Path = Path("runs")
+    """Folder that holds all runs."""
+    checkpoint_minutes: float = 10
+    """Wall-clock time between checkpoints."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import api, display
+
+        result = api.reproduce(
+            self.environments, self.variants, self.seeds, self.updates, workers=self.workers, runs=self.runs,
+            report=self.report, show=lambda stream: display.show_grid(stream, console),
+            tell=lambda text: console.print(text, soft_wrap=True), checkpoint_minutes=self.checkpoint_minutes,
         )  # fmt: skip
         return display.show_comparison(result, console)
 
@@ -232,7 +268,11 @@ class Protocols:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns its exit status: 0, 1 if a run failed, 2 for a user's error, 130 or 143 for a signal."""
+    """Run a command; returns its exit status.
+
+    0: done. 1: a run failed. 2: bad input, a number that is not finite counted in. 130, 143: saved and stopped by
+    SIGINT or SIGTERM.
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         command = parse(arguments or ["--help"])
@@ -267,6 +307,7 @@ def parse_with_defaults(arguments: Sequence[str], environment: str, variant: str
     commands: Any = (
         Annotated[Train, subcommand("train", default=train)]
         | Annotated[Compare, subcommand("compare", default=compare)]
+        | Annotated[Reproduce, subcommand("reproduce")]
         | Annotated[Resume, subcommand("resume")]
         | Annotated[Report, subcommand("report")]
         | Annotated[Evaluate, subcommand("evaluate")]
@@ -309,9 +350,16 @@ def limit_threads(threads: int | None) -> None:
         os.environ.update(thread_limits(threads))
 
 
-def train_and_show(config: Config, folder: Path, checkpoint_minutes: float, console: Console) -> int:
+def train_and_show(
+    config: Config,
+    folder: Path,
+    checkpoint_minutes: float,
+    console: Console,
+    tensorboard: bool = False,
+    wandb_project: str | None = None,
+) -> int:
     """Train in this process with a progress bar."""
-    from saclab import display
+    from saclab import display, trackers
     from saclab.signals import EXIT_STATUS, requests_from_signals
     from saclab.training.loop import train
     from saclab.training.run_folder import is_finished
@@ -319,12 +367,17 @@ def train_and_show(config: Config, folder: Path, checkpoint_minutes: float, cons
     if is_finished(folder):
         console.print(f"{folder} is finished already; its results are kept", soft_wrap=True, markup=False)
     with requests_from_signals() as requests:
+        stream = train(config, folder, requests, checkpoint_minutes)
+        if tensorboard:
+            stream = trackers.tensorboard(stream)
+        if wandb_project is not None:
+            stream = trackers.wandb(stream, wandb_project, config, folder)
         try:
-            for _ in display.show_run(train(config, folder, requests, checkpoint_minutes), console):
+            for _ in display.show_run(stream, console):
                 pass
         except TrainingFailed as error:
             print(f"saclab: {error}", file=sys.stderr)
-            return EXIT_FAILED
+            return EXIT_USER_ERROR if isinstance(error, NonFiniteError) else EXIT_FAILED
         if requests.stop:
             console.print(f"saved; continue with: saclab resume {folder}", soft_wrap=True, markup=False)
             return EXIT_STATUS.get(requests.stop, EXIT_FAILED)

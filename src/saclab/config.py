@@ -134,6 +134,8 @@ class TrainingSettings:
     """Test the policy after so many environment steps."""
     evaluation_episodes: int = 10
     """Episodes of one test, with the deterministic policy (tanh of the mean), stepped side by side."""
+    q_bias_episodes: int = 0
+    """Episodes of the stochastic policy after each test, from which the critics' bias is estimated; 0 for none."""
     log_interval: int = 200
     """Updates that are averaged into one line of metrics.jsonl."""
 
@@ -147,7 +149,8 @@ class TrainingSettings:
         for name in optional:
             value = getattr(self, name)
             require(value is None or value >= 1, name, value, "use a whole number of at least 1, or leave it out")
-        require(self.random_steps >= 0, "random_steps", self.random_steps, "use 0 or more")
+        for name in ("random_steps", "q_bias_episodes"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "use 0 or more")
         require(
             (self.max_steps, self.max_updates, self.max_episodes) != (None, None, None),
             "max_steps", None, "give at least one of max_steps, max_updates and max_episodes",

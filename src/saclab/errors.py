@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 
 class UserError(Exception):
@@ -27,6 +28,11 @@ class TrainingFailed(RuntimeError):  # noqa: N818 - it names what happened
 
 class NonFiniteError(TrainingFailed):
     """An environment or an update gave a number that is not finite."""
+
+    def __init__(self, message: str, arrays: Mapping[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.arrays = dict(arrays or {})
+        """Name -> NumPy array: what is left for a look at the step."""
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:

@@ -14,6 +14,7 @@ from saclab.algorithm.policy import make_policy
 from saclab.config import AlgorithmSettings, Config
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
+from saclab.files import replace_file, write_json
 
 ARRAYS, DESCRIPTION = "policy.safetensors", "policy.json"
 
@@ -66,9 +67,7 @@ def save_policy(folder: Path, config: Config, spec: EnvironmentSpec, actor: np.n
     """Write a policy with what is needed to use it; `facts` are told beside it."""
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {"actor": actor, "action_low": spec.action_low, "action_high": spec.action_high}
-    temporary = folder / (ARRAYS + ".partial")
-    temporary.write_bytes(safetensors.numpy.save(arrays))
-    temporary.replace(folder / ARRAYS)
+    replace_file(folder / ARRAYS, safetensors.numpy.save(arrays))
     description = {
         "environment": config.environment,
         "environment_arguments": config.environment_arguments,
@@ -77,7 +76,7 @@ def save_policy(folder: Path, config: Config, spec: EnvironmentSpec, actor: np.n
         "algorithm": dataclasses.asdict(config.algorithm),
         **facts,
     }
-    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
+    write_json(folder / DESCRIPTION, description)
 
 
 def policy_folder(run: Path) -> Path:
@@ -86,21 +85,53 @@ def policy_folder(run: Path) -> Path:
 
 
 def read_description(run: Path) -> dict[str, Any]:
-    """policy.json: the environment the policy is for, and its settings."""
-    description: dict[str, Any] = json.loads((policy_folder(run) / DESCRIPTION).read_text())
+    """policy.json: the environment the policy is for, and its settings; raises UserError if it is damaged."""
+    path = policy_folder(run) / DESCRIPTION
+    try:
+        description: dict[str, Any] = json.loads(path.read_text())
+        if not isinstance(description["environment"], str) or not isinstance(
+            description["environment_arguments"], dict
+        ):
+            raise TypeError("it names no environment")
+    except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is damaged ({error}): train again, or resume the run if it is unfinished") from error
     return description
 
 
 def load_policy(run: Path | str) -> TrainedPolicy:
-    """The best policy of a run, from its folder or from its `best` folder; raises UserError if there is none."""
+    """The best policy of a run, from its folder or from its `best` folder.
+
+    Raises:
+        UserError: if there is none, or its files are damaged.
+    """
     folder = policy_folder(Path(run))
     if not (folder / ARRAYS).is_file():
         raise UserError(f"{run} holds no policy yet: the first is kept after the run's first evaluation")
-    arrays = safetensors.numpy.load_file(folder / ARRAYS)
     description = read_description(folder)
-    algorithm = description["algorithm"]
-    settings = AlgorithmSettings(**{**algorithm, "hidden_layers": tuple(algorithm["hidden_layers"])})
-    spec = EnvironmentSpec(
-        description["observation_size"], description["action_size"], arrays["action_low"], arrays["action_high"]
-    )
-    return TrainedPolicy(settings, spec, arrays["actor"])
+    try:
+        arrays = safetensors.numpy.load_file(folder / ARRAYS)
+        algorithm = description["algorithm"]
+        settings = AlgorithmSettings(**{**algorithm, "hidden_layers": tuple(algorithm["hidden_layers"])})
+        sizes = int(description["observation_size"]), int(description["action_size"])
+        policy = TrainedPolicy(
+            settings, EnvironmentSpec(*sizes, arrays["action_low"], arrays["action_high"]), arrays["actor"]
+        )
+        require_arrays(policy)
+    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"the policy in {folder} is damaged ({error}): train again, or resume the run if it is unfinished"
+        ) from error
+    return policy
+
+
+def require_arrays(policy: TrainedPolicy) -> None:
+    """Raise ValueError unless the arrays are those of the policy's sizes."""
+    spec = policy.spec
+    expected = {
+        "actor": (policy.parameters, (policy.policy.network.parameters,)),
+        "action_low": (spec.action_low, (spec.action_size,)),
+        "action_high": (spec.action_high, (spec.action_size,)),
+    }
+    for name, (array, shape) in expected.items():
+        if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
+            raise ValueError(f"{name} is not f32{list(shape)} of finite numbers")

@@ -145,7 +145,7 @@ def test_a_value_beyond_32_bits_is_refused_before_it_reaches_the_replay_buffer_a
 def test_a_captured_episode_goes_on_in_another_instance_with_its_sums():
     first, second = counting(2, "CapturableCounting-v0"), counting(2, "CapturableCounting-v0")
     walk(first, 3)
-    assert second.restore(first.capture()) == []
+    assert second.restore(first.capture(), [7, 8]) == []
     assert (second.total_rewards.tolist(), second.lengths.tolist()) == ([6.0, 6.0], [3, 3])
     (ours, our_ends), (theirs, their_ends) = walk(first, 9), walk(second, 9)
     for mine, other in zip(ours, theirs, strict=True):
@@ -158,5 +158,5 @@ def test_an_environment_that_cannot_be_captured_is_named_and_starts_anew():
     first, second = counting(2), counting(2)
     walk(first, 3)
     assert first.capture() == [None, None]
-    assert second.restore(first.capture()) == [0, 1]
+    assert second.restore(first.capture(), [7, 8]) == [0, 1]
     assert second.lengths.tolist() == [0, 0]

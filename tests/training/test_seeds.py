@@ -40,4 +40,5 @@ def test_the_streams_of_seed_7_are_what_they_have_always_been():
         "exploration": [1685402102, 1386913335],
         "replay": [2234724314, 3259368143],
         "evaluation": [3018317685, 2422078069],
+        "q_bias": [2673742827, 1134846047],
     }

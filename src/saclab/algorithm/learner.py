@@ -27,6 +27,8 @@ class Learner(NamedTuple):
     """A body for jit and `lax.scan`; `jax.vmap` runs many learners at once."""
     policy: Policy
     """What `LearnerState.actor` parametrises."""
+    q_network: Network
+    """What each row of `LearnerState.critic` parametrises, on an observation and an action side by side."""
 
 
 class Parts(NamedTuple):
@@ -65,7 +67,7 @@ def make_learner(settings: AlgorithmSettings, observation_size: int, action_size
         actor_optimizer=optax.adam(settings.actor_learning_rate),
         critic_optimizer=optax.adam(settings.critic_learning_rate),
     )
-    return Learner(partial(init, parts), partial(update, parts), parts.policy)
+    return Learner(partial(init, parts), partial(update, parts), parts.policy, parts.q_network)
 
 
 def init(parts: Parts, key: jax.Array) -> LearnerState:

@@ -1,23 +1,33 @@
 """Capture and restore the exact state of an environment, the simulator's hidden state included.
 
-A state is a dictionary of NumPy arrays and plain values. Environments that saclab cannot look into may offer the two
-methods `saclab_capture() -> dict[str, np.ndarray]` and `saclab_restore(dict[str, np.ndarray])`.
+A state is a dictionary of NumPy arrays and plain values. Only the very classes named here are looked into: a subclass
+of one may keep more than saclab knows of. Such an environment, or any other, may offer the two methods
+`saclab_capture() -> dict[str, np.ndarray]` and `saclab_restore(dict[str, np.ndarray])`; `capture_mujoco` and
+`restore_mujoco` are there to be called by them. Its generator `np_random` is captured in any case.
 """
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import gymnasium
 import numpy as np
 from gymnasium.envs.classic_control import Continuous_MountainCarEnv, PendulumEnv
 from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import (
+    ClipAction,
+    FlattenObservation,
+    OrderEnforcing,
+    PassiveEnvChecker,
+    RescaleAction,
+    TimeLimit,
+)
 
 Environment: TypeAlias = gymnasium.Env[Any, Any]
 State: TypeAlias = dict[str, Any]
 
-STATELESS_WRAPPERS = (OrderEnforcing, PassiveEnvChecker)  # nothing in them changes within an episode
+# Nothing in them changes within an episode.
+STATELESS_WRAPPERS = (ClipAction, FlattenObservation, OrderEnforcing, PassiveEnvChecker, RescaleAction)
 
 
 def capture_state(environment: Environment) -> State | None:
@@ -25,9 +35,9 @@ def capture_state(environment: Environment) -> State | None:
     elapsed_steps = []
     inner = environment
     while isinstance(inner, gymnasium.Wrapper):
-        if isinstance(inner, TimeLimit):
+        if type(inner) is TimeLimit:
             elapsed_steps.append(int(inner._elapsed_steps or 0))
-        elif not isinstance(inner, STATELESS_WRAPPERS):
+        elif type(inner) not in STATELESS_WRAPPERS:
             return None
         inner = inner.env
     physics = capture_physics(inner)
@@ -41,13 +51,19 @@ def capture_state(environment: Environment) -> State | None:
 
 
 def restore_state(environment: Environment, state: State) -> None:
-    """Continue an episode from `capture_state` in an environment of the same kind that has been reset once."""
-    elapsed_steps = iter(state["elapsed_steps"])
+    """Continue an episode from `capture_state` in an environment of the same kind that has been reset once.
+
+    Raises:
+        KeyError, TypeError, ValueError or OverflowError: if `state` is not one of this kind of environment.
+    """
+    limits = []
     inner = environment
     while isinstance(inner, gymnasium.Wrapper):
-        if isinstance(inner, TimeLimit):
-            inner._elapsed_steps = next(elapsed_steps)
+        if type(inner) is TimeLimit:
+            limits.append(inner)
         inner = inner.env
+    for limit, elapsed_steps in zip(limits, state["elapsed_steps"], strict=True):
+        limit._elapsed_steps = elapsed_steps
     restore_physics(inner, state["physics"])
     inner.np_random.bit_generator.state = state["generator"]
 
@@ -57,17 +73,29 @@ def capture_physics(environment: Environment) -> dict[str, np.ndarray] | None:
     if hasattr(environment, "saclab_capture"):
         captured: dict[str, np.ndarray] = environment.saclab_capture()
         return captured
-    if isinstance(environment, MujocoEnv):
+    if is_gymnasium_mujoco(environment):
         return capture_mujoco(environment)
-    if isinstance(environment, PendulumEnv | Continuous_MountainCarEnv):
-        return {"state": np.array(environment.state)}
+    if type(environment) in CLASSIC_CONTROL:
+        return {"state": np.array(getattr(environment, "state"))}  # noqa: B009 - mypy does not know the class
     return None
+
+
+CLASSIC_CONTROL = (PendulumEnv, Continuous_MountainCarEnv)
+
+
+def is_gymnasium_mujoco(environment: Environment) -> TypeGuard[MujocoEnv]:
+    """Whether it is one of Gymnasium's own MuJoCo environments, which keep nothing but the simulator's state."""
+    return isinstance(environment, MujocoEnv) and type(environment).__module__.startswith("gymnasium.envs.mujoco.")
 
 
 def restore_physics(environment: Environment, physics: dict[str, np.ndarray]) -> None:
     if hasattr(environment, "saclab_restore"):
         environment.saclab_restore(physics)
-    elif isinstance(environment, MujocoEnv):
+        return
+    for name, array in (capture_physics(environment) or {}).items():
+        if physics[name].shape != array.shape or physics[name].dtype != array.dtype:
+            raise ValueError(f"{name} is not {array.dtype}{list(array.shape)}")
+    if is_gymnasium_mujoco(environment):
         restore_mujoco(environment, physics)
     else:
         setattr(environment, "state", physics["state"].copy())  # noqa: B010 - classic control keeps it there
@@ -78,6 +106,7 @@ LAGGING = ("xpos", "xipos", "subtree_com")
 
 
 def capture_mujoco(environment: MujocoEnv) -> dict[str, np.ndarray]:
+    """The whole state of the simulator, the derived quantities that lag behind it included."""
     import mujoco
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION

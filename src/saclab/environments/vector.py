@@ -67,7 +67,7 @@ class TrainingEnvironments:
         for index, environment in enumerate(self.environments):
             seen, gained, terminated[index], truncated, _ = environment.step(scaled[index])
             next_observation[index], reward[index] = seen, gained
-            self._require_finite(index, next_observation[index], float(gained))
+            self._require_finite(index, next_observation[index], float(reward[index]), scaled[index])
             self.total_rewards[index] += float(gained)
             self.lengths[index] += 1
             if terminated[index] or truncated:
@@ -93,12 +93,16 @@ class TrainingEnvironments:
             states.append(state)
         return states
 
-    def restore(self, states: list[dict[str, Any] | None]) -> list[int]:
-        """Continue from `capture`. Environments whose state could not be captured start a new episode; returns them."""
+    def restore(self, states: list[dict[str, Any] | None], seeds: list[int]) -> list[int]:
+        """Continue from `capture`; the environments whose state could not be captured and that started anew.
+
+        Those start an episode from their entry of `seeds`, which should not have been used before.
+        """
         restarted = []
         for index, (environment, state) in enumerate(zip(self.environments, states, strict=True)):
             if state is None:
                 restarted.append(index)
+                self._start_episode(index, seed=seeds[index])
                 continue
             restore_state(environment, state)
             self.observation[index] = state["observation"]
@@ -112,9 +116,9 @@ class TrainingEnvironments:
     def _start_episode(self, index: int, seed: int | None = None) -> None:
         self.observation[index], _ = self.environments[index].reset(seed=seed)
         self.total_rewards[index], self.lengths[index] = 0.0, 0
-        self._require_finite(index, self.observation[index], 0.0)
+        self._require_finite(index, self.observation[index], 0.0, np.zeros(0, np.float32))
 
-    def _require_finite(self, index: int, observation: np.ndarray, reward: float) -> None:
+    def _require_finite(self, index: int, observation: np.ndarray, reward: float, action: np.ndarray) -> None:
         if np.isfinite(reward) and np.isfinite(observation).all():
             return
         broken = np.flatnonzero(~np.isfinite(observation)).tolist()
@@ -122,5 +126,6 @@ class TrainingEnvironments:
         raise NonFiniteError(
             f"environment {self.name} number {index} gave a value that is not finite ({what}) in step "
             f"{int(self.lengths[index]) + 1} of an episode: check the environment, or wrap it so that it ends the "
-            "episode before it diverges"
+            "episode before it diverges",
+            {"action": action, "next_observation": observation.copy(), "reward": np.array(reward)},
         )

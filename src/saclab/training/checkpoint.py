@@ -8,7 +8,8 @@
 
 The newest two are kept. A segment of the replay buffer that has not changed since the checkpoint before the last is
 hard-linked from it, not written again; never from the last one, so that the two kept checkpoints share no file and
-damage to one leaves the other whole.
+damage to one leaves the other whole. A checkpoint that could not be used is set aside as step-….damaged, so that none
+of its files is linked to, and goes when the next one has been written.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,13 +28,17 @@ import numpy as np
 import safetensors.numpy
 
 from saclab.errors import TrainingFailed
-from saclab.replay import ReplayBuffer
+from saclab.files import sync, write_bytes
+from saclab.replay import ReplayBuffer, available_memory
 
 FORMAT = 1
 KEPT = 2
 SEGMENT_ROWS = 8192
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
 SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
+CHECKPOINT_NAME = re.compile(r"step-\d{12,}")
+MANIFEST_BYTES = 2**26  # far more than the plain state of a thousand environments
+LARGEST_COUNT = 2**53
 
 Arrays = dict[str, np.ndarray]
 
@@ -60,40 +65,56 @@ def save_checkpoint(folder: Path, step: int, checkpoint: Checkpoint, replay: Rep
         return final
     partial = final.with_suffix(".partial")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_unfinished(folder)
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            sync(folder.parent)
+        remove_all(folder.glob("step-*.partial"))
         partial.mkdir()
         write_files(partial, checkpoint, replay, link_from=replaced_by_next(folder))
         sync(partial)
         partial.rename(final)
         sync(folder)
+        for old in newest_first(folder)[KEPT:]:
+            old.rename(old.with_suffix(".partial"))  # from now on it is no checkpoint, however far the removal gets
+        remove_all([*folder.glob("step-*.partial"), *folder.glob("step-*.damaged")])
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
-        kept = newest_first(folder)
-        reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error)
-        raise CheckpointError(
-            f"cannot save {final}: {reason}. "
-            + (f"The last good checkpoint, {kept[0].name}, is kept" if kept else "There is no earlier checkpoint")
-            + f"; make room, then continue with: saclab resume {folder.parent}"
-        ) from error
-    for old in newest_first(folder)[KEPT:]:
-        shutil.rmtree(old)
+        raise CheckpointError(cannot_save(final, error)) from error
     return final
+
+
+def cannot_save(final: Path, error: OSError) -> str:
+    """What happened, what is kept, and the way out."""
+    kept = newest_first(final.parent)
+    reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error)
+    return (
+        f"cannot save {final}: {reason}. "
+        + (f"The last good checkpoint, {kept[0].name}, is kept" if kept else "There is no earlier checkpoint")
+        + f"; make room, then continue with: saclab resume {final.parent.parent}"
+    )
 
 
 def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[str], None]) -> Checkpoint | None:
     """The newest checkpoint that is whole, its transitions put into `replay`; None if there is none at all.
 
+    Newer ones that are not whole are set aside.
+
     Raises:
-        CheckpointError: if there are checkpoints and every one is damaged.
+        CheckpointError: if there are checkpoints and every one is damaged; they stay as they are.
     """
-    problems = []
+    damaged, problems = [], []
     for path in newest_first(folder):
         try:
-            return read_checkpoint(path, replay)
+            checkpoint = read_checkpoint(path, replay)
         except (CheckpointError, OSError) as error:
+            damaged.append(path)
             problems.append(f"{path} is damaged: {error}")
-            warn(problems[-1] + "; the one before it is tried")
+            continue
+        for bad, problem in zip(damaged, problems, strict=True):
+            shutil.rmtree(bad.with_suffix(".damaged"), ignore_errors=True)
+            bad.rename(bad.with_suffix(".damaged"))
+            warn(f"{problem}; it is set aside, and {path.name} before it is used")
+        return checkpoint
     if problems:
         raise CheckpointError("no checkpoint can be used. " + "; ".join(problems))
     return None
@@ -101,7 +122,8 @@ def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[s
 
 def newest_first(folder: Path) -> list[Path]:
     """The finished checkpoints."""
-    return sorted((path for path in folder.glob("step-*") if path.suffix != ".partial"), reverse=True)
+    found = [path for path in folder.glob("step-*") if CHECKPOINT_NAME.fullmatch(path.name)]
+    return sorted(found, key=lambda path: int(path.name.removeprefix("step-")), reverse=True)
 
 
 def replaced_by_next(folder: Path) -> Path | None:
@@ -110,8 +132,8 @@ def replaced_by_next(folder: Path) -> Path | None:
     return existing[KEPT - 1] if len(existing) >= KEPT else None
 
 
-def remove_unfinished(folder: Path) -> None:
-    for path in folder.glob("step-*.partial"):
+def remove_all(paths: Iterable[Path]) -> None:
+    for path in paths:
         shutil.rmtree(path)
 
 
@@ -136,18 +158,37 @@ def write_files(folder: Path, checkpoint: Checkpoint, replay: ReplayBuffer, link
 
 
 def write_replay(folder: Path, replay: ReplayBuffer, link_from: Path | None) -> dict[str, dict[str, Any]]:
-    """Write the changed segments and link the others; `version` tells whether a segment has changed."""
-    old_files: dict[str, dict[str, Any]] = read_manifest(link_from)["files"] if link_from else {}
+    """Link the segments that `link_from` has already and write the others; `version` tells what a segment holds."""
+    old_files = linkable_files(link_from)
     files = {}
     for index, rows in enumerate(segments(replay)):
         name = f"replay-{index:04d}.safetensors"
         version = segment_version(index, replay)
-        if link_from and old_files.get(name, {}).get("version") == version:
-            link_or_copy(link_from / name, folder / name)
-            files[name] = old_files[name]
+        entry = old_files.get(name, {})
+        if link_from and entry.get("version") == version and linked(link_from / name, folder / name, entry["bytes"]):
+            files[name] = entry
         else:
             files[name] = write_arrays(folder / name, {"rows": rows}) | {"version": version}
     return files
+
+
+def linkable_files(folder: Path | None) -> dict[str, dict[str, Any]]:
+    """The files of a checkpoint by their manifest; none if there is no checkpoint or it is damaged."""
+    try:
+        return read_manifest(folder)["files"] if folder else {}
+    except (CheckpointError, OSError):
+        return {}
+
+
+def linked(source: Path, destination: Path, size: int) -> bool:
+    """Link a file that has the size it should have; False if there is none or the file system has no links."""
+    try:
+        if source.stat().st_size != size:
+            return False
+        os.link(source, destination)
+    except OSError:
+        return False
+    return True
 
 
 def segments(replay: ReplayBuffer) -> Iterator[np.ndarray]:
@@ -174,67 +215,90 @@ def write_arrays(path: Path, arrays: Arrays) -> dict[str, Any]:
     return {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    with path.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def link_or_copy(source: Path, destination: Path) -> None:
-    try:
-        os.link(source, destination)
-    except OSError:  # a file system without hard links
-        shutil.copyfile(source, destination)
-
-
-def sync(folder: Path) -> None:
-    """Make renames and new names in a folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-# --- reading
+# --- reading: every value is checked before it is used, as the folder may come from anywhere
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest, checked against its own checksum."""
-    content = (folder / MANIFEST).read_bytes()
-    expected = (folder / MANIFEST_CHECKSUM).read_bytes().decode(errors="replace").strip()
-    if hashlib.sha256(content).hexdigest() != expected:
+    """The manifest, checked against its own checksum, every entry of the type that `write_files` gives it."""
+    content = read_plain_file(folder / MANIFEST, MANIFEST_BYTES)
+    expected = read_plain_file(folder / MANIFEST_CHECKSUM, 2 * len(hashlib.sha256().hexdigest()))
+    if hashlib.sha256(content).hexdigest() != expected.decode(errors="replace").strip():
         raise CheckpointError(f"{MANIFEST} does not match its checksum")
-    manifest: dict[str, Any] = json.loads(content)
-    if manifest["format"] != FORMAT:
-        raise CheckpointError(f"it has format {manifest['format']}, and this version of saclab reads {FORMAT}")
+    try:
+        manifest = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{MANIFEST} is not JSON: {error}") from error
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        found = manifest.get("format") if isinstance(manifest, dict) else None
+        raise CheckpointError(f"it has format {found!r}, and this version of saclab reads format {FORMAT}")
+    require_parts(manifest)
     return manifest
+
+
+def require_parts(manifest: dict[str, Any]) -> None:
+    for part in ("files", "replay", "state"):
+        if not isinstance(manifest.get(part), dict):
+            raise CheckpointError(f"the entry {part!r} of its manifest is not what saclab writes")
+    for name, entry in manifest["files"].items():
+        if not SAFE_FILE.fullmatch(name):
+            raise CheckpointError(f"its manifest names a file {name!r} that no checkpoint has")
+        if not isinstance(entry, dict) or not is_count(entry.get("bytes")) or not isinstance(entry.get("sha256"), str):
+            raise CheckpointError(f"its manifest has no size and checksum for {name}")
+    for name in ("added", "capacity", "segment_rows"):
+        if not is_count(manifest["replay"].get(name)):
+            raise CheckpointError(f"its manifest has {name} = {manifest['replay'].get(name)!r} for the replay buffer")
+
+
+def is_count(value: object) -> bool:
+    return type(value) is int and 0 <= value < LARGEST_COUNT
 
 
 def read_checkpoint(folder: Path, replay: ReplayBuffer) -> Checkpoint:
     """Read and check every file; raises CheckpointError if one is not as it was written."""
     manifest = read_manifest(folder)
+    buffer = manifest["replay"]
+    if buffer["capacity"] != replay.capacity:
+        raise CheckpointError(f"its replay capacity is {buffer['capacity']}, not {replay.capacity}")
+    size, length = min(buffer["added"], replay.capacity), max(1, buffer["segment_rows"])
+    starts = {f"replay-{index:04d}.safetensors": start for index, start in enumerate(range(0, size, length))}
+    replay_files = {name for name in manifest["files"] if name.startswith("replay-")}
+    if replay_files != starts.keys():
+        raise CheckpointError(f"its replay files are not those of {size} transitions in segments of {length}")
     groups = {}
-    if manifest["replay"]["capacity"] != replay.capacity:
-        raise CheckpointError(f"its replay capacity is {manifest['replay']['capacity']}, not {replay.capacity}")
     for name, entry in manifest["files"].items():
         arrays = read_arrays(folder, name, entry)
-        stem = name.removesuffix(".safetensors")
-        if stem.startswith("replay-"):
-            start = int(stem.removeprefix("replay-")) * manifest["replay"]["segment_rows"]
-            replay.rows[start : start + len(arrays["rows"])] = arrays["rows"]
+        if name in starts:
+            rows, start = arrays.get("rows"), starts[name]
+            expected = (min(length, size - start), replay.layout.width)
+            if rows is None or rows.shape != expected or rows.dtype != np.float32:
+                raise CheckpointError(f"{name} does not hold transitions f32{list(expected)}")
+            replay.rows[start : start + len(rows)] = rows
         else:
-            groups[stem] = arrays
-    replay.added = manifest["replay"]["added"]
+            groups[name.removesuffix(".safetensors")] = arrays
+    replay.added = buffer["added"]
     return Checkpoint(groups, manifest["state"])
 
 
 def read_arrays(folder: Path, name: str, entry: dict[str, Any]) -> Arrays:
-    if not SAFE_FILE.fullmatch(name):
-        raise CheckpointError(f"its manifest names a file {name!r} that no checkpoint has")
-    content = (folder / name).read_bytes()
-    if len(content) != entry["bytes"] or hashlib.sha256(content).hexdigest() != entry["sha256"]:
+    """The arrays of a file, once its size and checksum are those of its manifest entry."""
+    size = entry["bytes"]
+    content = read_plain_file(folder / name, size)
+    if len(content) != size or hashlib.sha256(content).hexdigest() != entry["sha256"]:
         raise CheckpointError(f"{name} does not match its checksum")
-    arrays: Arrays = safetensors.numpy.load(content)
+    try:
+        arrays: Arrays = safetensors.numpy.load(content)
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{name} is not a safetensors file: {error}") from error
     return arrays
+
+
+def read_plain_file(path: Path, limit: int) -> bytes:
+    """A file of at most `limit` bytes, which memory must hold; never a link, a pipe or a device."""
+    if path.is_symlink() or not path.is_file():
+        raise CheckpointError(f"{path.name} is missing")
+    size, available = path.stat().st_size, available_memory()
+    if size > limit:
+        raise CheckpointError(f"{path.name} has {size} bytes, more than the {limit} that were written")
+    if available is not None and size > available:
+        raise CheckpointError(f"{path.name} has {size} bytes, and {available} bytes of memory are free")
+    return path.read_bytes()

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
-import fcntl
-import json
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-
-import numpy as np
-import safetensors.numpy
 
 from saclab.algorithm.types import Metrics
 from saclab.config import Config
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError, TrainingFailed, UserError
+from saclab.files import write_json
 from saclab.trained_policy import save_policy
-from saclab.training.checkpoint import load_newest_checkpoint, save_checkpoint
+from saclab.training.captured import part, plain_numbers
+from saclab.training.checkpoint import CheckpointError, load_newest_checkpoint, newest_first, save_checkpoint
 from saclab.training.events import (
     EpisodeEnded,
     Evaluated,
@@ -33,13 +29,16 @@ from saclab.training.events import (
     UpdatesLogged,
     Warned,
 )
+from saclab.training.failure import write_failure
+from saclab.training.lock import locked
+from saclab.training.machine import different_facts, machine_facts
 from saclab.training.requests import Requests
-from saclab.training.run import Run, named_leaves
-from saclab.training.run_folder import FORMAT, Logs, is_finished, machine_facts, read_config_file, write_json
+from saclab.training.run import Run, Stopped
+from saclab.training.run_folder import FORMAT, Logs, append_line, is_finished, read_config
 
 PROGRESS_SECONDS = 0.25
 SANE_TEMPERATURES = (1e-5, 100.0)
-RECENT_ROWS = 1000  # transitions left for a look at a failure
+EVALUATE_FIRST = -1  # for `evaluation_slots`: a test is due before the next step
 
 
 def train(
@@ -60,24 +59,27 @@ def train(
     if is_finished(folder):
         require_same_config(folder, config)
         return
-    run = Run(config)  # before the folder is touched: bad input leaves nothing behind
-    try:
-        with locked(folder):
-            session = Session(run, folder, requests or Requests(), checkpoint_minutes)
-            try:
+    with closing(Run(config)) as run:  # before the folder is touched: bad input leaves nothing behind
+        try:
+            with locked(folder), closing(Session(run, folder, requests or Requests(), checkpoint_minutes)) as session:
                 yield from session.events()
-            except NonFiniteError as error:
-                write_failure(folder, run)
-                raise NonFiniteError(f"{error}. What led to it lies in {folder / 'failure'}") from error
-            except OSError as error:
-                raise TrainingFailed(
-                    f"cannot write to {folder}: {error.strerror}; its last checkpoint is kept: make room, then "
-                    f"continue with: saclab resume {folder}"
-                ) from error
-            finally:
-                session.logs.close()
-    finally:
-        run.close()
+        except NonFiniteError as error:
+            raise NonFiniteError(f"{error}. {what_is_left(folder, run, error)}") from error
+        except OSError as error:
+            raise TrainingFailed(
+                f"cannot write to {folder}: {error.strerror or error}; what was saved is kept: make room, or give this "
+                f"process leave to write there, then start the same command again or: saclab resume {folder}"
+            ) from error
+
+
+def what_is_left(folder: Path, run: Run, error: NonFiniteError) -> str:
+    """Where to look after a number that is not finite."""
+    try:
+        left = f"What led to it lies in {write_failure(folder, run, error)}"
+    except OSError as problem:
+        left = f"What led to it could not be written to {folder} ({problem.strerror})"
+    kept = newest_first(folder / "checkpoints")
+    return left + (f"; the last checkpoint, {kept[0].name}, is kept" if kept else "")
 
 
 class Session:
@@ -104,12 +106,12 @@ class Session:
     def events(self) -> Iterator[Event]:
         run = self.run
         yield Started(self.folder, self.resumed_at_step, tuple(self.notes))
-        while (reason := run.finish_reason()) is None:
-            for episode in run.step():
-                yield from self._log_episode(episode)
-            yield from self._log_updates()
+        while True:
             if run.evaluation_due():
-                yield self._evaluate()
+                try:
+                    yield self._evaluate()
+                except Stopped:
+                    run.counters.evaluation_slots = EVALUATE_FIRST
             if self.requests.stop:
                 yield self._save()
                 yield Interrupted(run.counters.steps)
@@ -120,7 +122,17 @@ class Session:
             if now - self.last_progress > PROGRESS_SECONDS:
                 self.last_progress = now
                 yield self._progress()
+            if (reason := run.finish_reason()) is not None:
+                break
+            for episode in run.step():
+                yield from self._log_episode(episode)
+            yield from self._log_updates()
         yield from self._finish(reason)
+
+    def close(self) -> None:
+        """Close the logs; what is still unwritten on a full disk belongs to steps after the last checkpoint."""
+        with suppress(OSError):
+            self.logs.close()
 
     def _seconds(self) -> float:
         """Wall-clock time of the run, earlier sessions counted in."""
@@ -173,11 +185,15 @@ class Session:
 
     def _evaluate(self) -> Evaluated:
         run, counters = self.run, self.run.counters
-        episodes, best = run.evaluate()
+        episodes, best = run.evaluate(lambda: self.requests.stop != 0)
         self.logs.evaluation(
             counters.evaluations, counters.steps, counters.updates, counters.episodes, counters.last_return,
             *episodes.total_rewards.tolist(), *episodes.lengths.tolist(), self._seconds(),
         )  # fmt: skip
+        if (bias := run.q_bias()) is not None:
+            self.logs.q_bias(
+                counters.evaluations, counters.steps, counters.updates, counters.episodes, *bias, self._seconds()
+            )
         if best:
             self._write_best()
         return Evaluated(
@@ -203,18 +219,25 @@ class Session:
 
     def _restore(self) -> dict[str, int] | None:
         """Continue from the newest checkpoint that is whole; the lengths of the logs at that time."""
-        checkpoint = load_newest_checkpoint(self.folder / "checkpoints", self.run.replay, self.notes.append)
+        checkpoints = self.folder / "checkpoints"
+        checkpoint = load_newest_checkpoint(checkpoints, self.run.replay, self.notes.append)
         if checkpoint is None:
             return None
-        restarted = self.run.restore(checkpoint)
+        try:
+            restarted = self.run.restore(checkpoint)
+            positions = plain_numbers(part(checkpoint.state, "logs", dict), dict.fromkeys(checkpoint.state["logs"], 0))
+        except CheckpointError as error:
+            raise CheckpointError(
+                f"cannot continue {self.folder}: {error}. If a checkpoint does not belong to this run or has been "
+                f"changed, remove {checkpoints} to train from the start"
+            ) from error
         if restarted:
             self.notes.append(
                 f"the exact state of {self.run.config.environment} cannot be captured: environments {restarted} "
                 "started a new episode, so this run is not bit for bit what it would have been"
             )
-        self.notes += different_facts(checkpoint.state["facts"])
+        self.notes += different_facts(checkpoint.state.get("facts"))
         self._write_best()
-        positions: dict[str, int] = checkpoint.state["logs"]
         return positions
 
     def _record_session(self) -> None:
@@ -226,14 +249,18 @@ class Session:
             "notes": self.notes[1:],
             **machine_facts(),
         }
-        with (self.folder / "sessions.jsonl").open("a") as file:
-            file.write(json.dumps(entry) + "\n")
+        append_line(self.folder / "sessions.jsonl", entry)
 
     def _finish(self, reason: str) -> Iterator[Event]:
         counters = self.run.counters
         yield from self._log_updates(last=True)
         if counters.evaluated_at_update != counters.updates:
-            yield self._evaluate()
+            try:
+                yield self._evaluate()
+            except Stopped:
+                yield self._save()
+                yield Interrupted(counters.steps)
+                return
         counters.seconds = self._seconds()
         yield self._save()
         assert counters.best_return is not None
@@ -269,55 +296,12 @@ def ratio_note(config: Config) -> str:
     return note
 
 
-def write_failure(folder: Path, run: Run) -> None:
-    """Leave what is needed to look at a run that met a number that is not finite, in `folder`/failure."""
-    failure = folder / "failure"
-    failure.mkdir(exist_ok=True)
-    write_json(failure / "counters.json", dataclasses.asdict(run.counters))
-    recent = np.arange(run.replay.added - min(RECENT_ROWS, run.replay.size), run.replay.added) % run.replay.capacity
-    arrays = {name: np.array(leaf) for name, leaf in named_leaves(run.learner_state).items()}
-    arrays |= {"recent_transitions": run.replay.rows[recent], "observation": run.environments.observation}
-    if run.window:
-        arrays["metrics"] = np.stack([np.asarray(values) for values in run.window])
-    safetensors.numpy.save_file(arrays, failure / "state.safetensors")
-
-
 def require_same_config(folder: Path, config: Config) -> None:
     """Refuse a folder that holds a run with other settings."""
-    differences = Config.from_dict(read_config_file(folder)["config"]).differences(config)
+    differences = read_config(folder).differences(config)
     if differences:
         listed = "; ".join(f"{name} is {there!r} there, {here!r} here" for name, (there, here) in differences.items())
         raise UserError(
             f"{folder} already holds a run with other settings ({listed}): give this one a name of its own with "
             "--name, or another place with --runs"
         )
-
-
-def different_facts(saved: dict[str, dict[str, object]]) -> list[str]:
-    """Warnings for each version or machine fact that is not what the checkpoint was made with."""
-    return [
-        f"{name} was {then[name]} when the checkpoint was made and is {value} now: results may differ in the last bits"
-        + (f"; set NPROC={then[name]} to continue exactly" if name == "threads" else "")
-        for part, now in machine_facts().items()
-        for then in [saved[part]]
-        for name, value in now.items()
-        if then.get(name) != value
-    ]
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the run folder; the system lets go of it when the process ends, however it ends."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.seek(0)
-            raise UserError(
-                f"{folder} is in use by process {file.read().strip() or '?'}: wait for it, or stop it first"
-            ) from error
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        yield

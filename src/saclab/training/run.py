@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -19,10 +19,24 @@ from saclab.environments.vector import EndedEpisode, TrainingEnvironments
 from saclab.errors import NonFiniteError
 from saclab.replay import ReplayBuffer, RowLayout, require_memory
 from saclab.training import seeds
-from saclab.training.checkpoint import Arrays, Checkpoint
+from saclab.training.captured import (
+    join_arrays,
+    part,
+    plain_numbers,
+    require_like,
+    restore_generator,
+    split_arrays,
+)
+from saclab.training.checkpoint import Arrays, Checkpoint, CheckpointError
 from saclab.training.evaluation import EvaluationEpisodes, Evaluator
+from saclab.training.q_bias import Critics, QBias, measure_q_bias
+
 
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
+
+
+class Stopped(Exception):  # noqa: N818 - no error
+    """Asked to stop in the middle of a test, whose episodes so far count for nothing."""
 
 
 @dataclass
@@ -67,7 +81,7 @@ class Run:
         self.evaluator = Evaluator(config.environment, config.environment_arguments)
 
         learner = make_learner(algorithm, self.spec.observation_size, self.spec.action_size)
-        self.policy = learner.policy
+        self.policy, self.q_network = learner.policy, learner.q_network
         self.learner_state: LearnerState = jax.jit(learner.init)(seeds.learner_key(config.seed))
         self.update = compiled_update(algorithm, layout)
         self.exploration = seeds.generator(config.seed, "exploration")
@@ -88,7 +102,11 @@ class Run:
 
     def step(self) -> list[EndedEpisode]:
         """Step every environment once, store the transitions, make the updates due; the episodes that ended."""
-        transitions, ended = self.environments.step(self._next_action())
+        try:
+            transitions, ended = self.environments.step(self._next_action())
+        except NonFiniteError:
+            self.window_array()  # raises if an update broke first, and the environment only met what came of it
+            raise
         self.replay.add(transitions)
         self.counters.steps += len(self.environments)
         while self.counters.updates < self.config.training.updates_due(self.counters.steps):
@@ -132,13 +150,24 @@ class Run:
         counters.evaluation_slots = slots
         return due
 
-    def evaluate(self) -> tuple[EvaluationEpisodes, bool]:
-        """Test the policy as it is now; the episodes, and whether their mean return is the best so far."""
+    def evaluate(self, asked_to_stop: Callable[[], bool] = lambda: False) -> tuple[EvaluationEpisodes, bool]:
+        """Test the policy as it is now; the episodes, and whether their mean return is the best so far.
+
+        Raises:
+            Stopped: when `asked_to_stop`; the run is as before, but that `evaluation_due` has been asked.
+        """
         counters, actor = self.counters, self.actor
         test_seeds = seeds.integers(
             self.config.seed, "evaluation", self.config.training.evaluation_episodes, counters.evaluations
         )
-        episodes = self.evaluator.run(partial(self.policy.mode, actor), test_seeds)
+
+        def act(observation: np.ndarray) -> np.ndarray:
+            if asked_to_stop():
+                raise Stopped
+            action: np.ndarray = self.policy.mode(actor, observation)
+            return action
+
+        episodes = self.evaluator.run(act, test_seeds)
         counters.evaluations += 1
         counters.evaluated_at_update = counters.updates
         counters.last_return = float(episodes.total_rewards.mean())
@@ -147,6 +176,21 @@ class Run:
             counters.best_return, counters.best_at_episode = counters.last_return, counters.episodes
             self.best_actor = actor
         return episodes, best
+
+    def q_bias(self) -> QBias | None:
+        """How far the critics are from Monte-Carlo soft returns, as after the last test; None if not wanted."""
+        count, number = self.config.training.q_bias_episodes, self.counters.evaluations
+        if count == 0:
+            return None
+        critics = Critics(
+            self.policy, self.actor, self.q_network, np.array(self.learner_state.critic),
+            float(np.exp(np.asarray(self.learner_state.log_alpha))), self.config.algorithm.discount,
+        )  # fmt: skip
+        return measure_q_bias(
+            critics, self.evaluator.environments[0], self.spec,
+            seeds.integers(self.config.seed, "q_bias", count, number),
+            seeds.generator(self.config.seed, "q_bias", number),
+        )  # fmt: skip
 
     def finish_reason(self) -> str | None:
         """Why the run is at its end, or None if it is not."""
@@ -201,7 +245,8 @@ class Run:
         """
         learner = {name: np.asarray(leaf) for name, leaf in named_leaves(self.learner_state).items()}
         for name, array in learner.items():
-            if np.isnan(array).any():
+            zero_temperature = name == ".log_alpha" and array == -np.inf
+            if not (np.isfinite(array).all() or zero_temperature):
                 raise NonFiniteError(f"after update {self.counters.updates} {name} is not finite")
         environment_arrays, environment_states = split_arrays(self.environments.capture())
         groups: dict[str, Arrays] = {
@@ -220,22 +265,39 @@ class Run:
         return Checkpoint(groups, state)
 
     def restore(self, checkpoint: Checkpoint) -> list[int]:
-        """Continue from `capture`; the environments whose state could not be captured and that started anew."""
+        """Continue from `capture`; the environments whose state could not be captured and that started anew.
+
+        Raises:
+            CheckpointError: if it is not one of a run with this configuration.
+        """
+        groups, state = checkpoint
+        saved = groups.get("learner", {})
         leaves, structure = jax.tree.flatten(self.learner_state)
-        saved = checkpoint.groups["learner"]
         names = named_leaves(self.learner_state)
-        for name, leaf in zip(names, leaves, strict=True):
-            if name not in saved or saved[name].shape != leaf.shape:
-                raise ValueError(f"the checkpoint has no {name} of shape {leaf.shape}")
-        self.learner_state = jax.tree.unflatten(structure, [jnp.asarray(saved[name]) for name in names])
+        checked = [
+            require_like(name, saved.get(name), np.asarray(leaf)) for name, leaf in zip(names, leaves, strict=True)
+        ]
+        self.learner_state = jax.tree.unflatten(structure, [jnp.asarray(array) for array in checked])
         self._actor = None
-        self.window = list(checkpoint.groups["window"]["metrics"])
-        self.best_actor = checkpoint.groups.get("best", {}).get("actor")
-        self.counters = Counters(**checkpoint.state["counters"])
-        self.exploration.bit_generator.state = checkpoint.state["exploration"]
-        self.sampling.bit_generator.state = checkpoint.state["sampling"]
-        states = join_arrays(checkpoint.groups["environments"], checkpoint.state["environments"])
-        return self.environments.restore(states)
+        window = groups.get("window", {}).get("metrics", np.zeros(0))
+        width = len(Metrics._fields)
+        self.window = list(require_like("metrics", window, np.zeros((len(window), width), np.float32)))
+        if "best" in groups:
+            self.best_actor = require_like("best", groups["best"].get("actor"), self.actor)
+        self.counters = Counters(**plain_numbers(state.get("counters"), dataclasses.asdict(Counters())))
+        if self.counters.steps != self.replay.added:
+            raise CheckpointError(f"the checkpoint has {self.counters.steps} steps and {self.replay.added} transitions")
+        restore_generator("exploration", self.exploration, state.get("exploration"))
+        restore_generator("sampling", self.sampling, state.get("sampling"))
+        return self._restore_environments(groups.get("environments", {}), part(state, "environments", list))
+
+    def _restore_environments(self, arrays: Arrays, rest: list[Any]) -> list[int]:
+        states = join_arrays(arrays, rest, self.environments.observation)
+        new_seeds = seeds.integers(self.config.seed, "environments", len(states), self.counters.steps)
+        try:
+            return self.environments.restore(states, new_seeds)
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
+            raise CheckpointError(f"the checkpoint's state of the environments does not fit: {error}") from error
 
     def close(self) -> None:
         self.environments.close()
@@ -259,30 +321,3 @@ def compiled_update(
 def named_leaves(tree: Any) -> dict[str, Any]:
     """The arrays of a pytree by their path, such as `.optimizers.actor[0].mu`."""
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
-
-
-def split_arrays(states: list[dict[str, Any] | None]) -> tuple[Arrays, list[dict[str, Any] | None]]:
-    """Environment states as one flat dictionary of arrays, and the rest, which is JSON-able."""
-    arrays: Arrays = {}
-    rest: list[dict[str, Any] | None] = []
-    for index, state in enumerate(states):
-        if state is None:
-            rest.append(None)
-            continue
-        arrays |= {f"{index}.physics.{name}": array for name, array in state["physics"].items()}
-        arrays[f"{index}.observation"] = state["observation"]
-        rest.append({key: value for key, value in state.items() if key not in ("physics", "observation")})
-    return arrays, rest
-
-
-def join_arrays(arrays: Arrays, rest: list[dict[str, Any] | None]) -> list[dict[str, Any] | None]:
-    """The inverse of `split_arrays`."""
-    states: list[dict[str, Any] | None] = []
-    for index, state in enumerate(rest):
-        if state is None:
-            states.append(None)
-            continue
-        prefix = f"{index}.physics."
-        physics = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-        states.append({**state, "physics": physics, "observation": arrays[f"{index}.observation"]})
-    return states

@@ -14,10 +14,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-import platform
 import re
-from collections.abc import Iterable
-from importlib.metadata import version
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,9 +25,14 @@ from saclab.config import Config
 from saclab.errors import UserError
 
 FORMAT = 1
-LOGS = ("metrics.jsonl", "episodes.csv", "evaluations.csv")
+LOGS = ("metrics.jsonl", "episodes.csv", "evaluations.csv", "q_bias.csv")
 EPISODE_COLUMNS = ("episode", "steps", "updates", "return", "running_average", "length", "terminated", "seconds")
 """`episode` counts from 1 after the random steps; episodes that ended within them have number 0."""
+Q_BIAS_COLUMNS = (
+    "evaluation", "steps", "updates", "episodes", "pairs", "mean_q", "mean_return", "mean_bias", "bias_spread",
+    "seconds",
+)  # fmt: skip
+"""From `pairs` on, the fields of `saclab.training.q_bias.QBias`."""
 
 
 def evaluation_columns(episodes: int) -> tuple[str, ...]:
@@ -50,30 +53,24 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip(".") or "_"
 
 
-def machine_facts() -> dict[str, Any]:
-    """What could make the same configuration give other bits."""
-    packages = ("saclab", "jax", "jaxlib", "numpy", "optax", "gymnasium", "mujoco")
-    return {
-        "versions": {package: version(package) for package in packages} | {"python": platform.python_version()},
-        "machine": {"system": platform.platform(), "processor": platform.machine(), "threads": visible_threads()},
-    }
-
-
-def visible_threads() -> int:
-    """Threads that XLA uses on the CPU: its results depend on their number."""
-    return int(os.environ.get("NPROC") or len(os.sched_getaffinity(0)))
-
-
-def write_json(path: Path, value: object) -> None:
-    """Write whole or not at all."""
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(json.dumps(value, indent=2, ensure_ascii=False) + "\n")
-    temporary.replace(path)
-
-
 def read_config(run: Path) -> Config:
     """The configuration of a run folder; raises UserError if it is not one."""
-    return Config.from_dict(read_config_file(run)["config"])
+    return config_of(run, read_config_file(run))
+
+
+def config_of(run: Path, content: dict[str, Any]) -> Config:
+    """The configuration in what `read_config_file` read; raises UserError if there is none that works."""
+    try:
+        config = Config.from_dict(content["config"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise damaged(run / "config.json", error) from error
+    if not isinstance(config.environment, str) or not isinstance(config.environment_arguments, dict):
+        raise damaged(run / "config.json", "it names no environment")
+    return config
+
+
+def damaged(path: Path, reason: object) -> UserError:
+    return UserError(f"{path} is damaged ({reason}): restore it, or remove the folder and train again")
 
 
 def read_config_file(run: Path) -> dict[str, Any]:
@@ -82,19 +79,50 @@ def read_config_file(run: Path) -> dict[str, Any]:
         raise UserError(f"{run} is not a run folder: it has no config.json")
     try:
         content: dict[str, Any] = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path} is damaged ({error}): restore it, or remove the folder and train again") from error
-    if content.get("format") != FORMAT:
+    except (ValueError, RecursionError) as error:
+        raise damaged(path, error) from error
+    if not isinstance(content, dict) or "format" not in content:
+        raise damaged(path, "it is not what saclab writes")
+    if content["format"] != FORMAT:
         raise UserError(f"{path} has format {content.get('format')!r}, and this version of saclab reads {FORMAT}")
+    for part in ("config", "versions", "machine"):
+        if not isinstance(content.get(part), dict):
+            raise damaged(path, f"it has no {part}")
     return content
 
 
+def append_line(path: Path, value: object) -> None:
+    """Add a line of JSON, on a line of its own even if a crash cut the last one short."""
+    with path.open("a+b") as file:
+        end = file.seek(0, os.SEEK_END)
+        file.seek(max(0, end - 1))
+        torn = file.read(1) not in (b"", b"\n")
+        file.write(b"\n" * torn + json.dumps(value).encode() + b"\n")
+
+
 def read_last_session(run: Path) -> dict[str, Any]:
-    """The facts of the last session that worked on a run; those of its making if it has no session yet."""
+    """The facts of the last session that worked on a run; those of its making if it has no session yet.
+
+    Its `machine` has `threads`. Lines that a crash or anything else has damaged are passed over.
+    """
     path = run / "sessions.jsonl"
-    lines = path.read_text().splitlines() if path.is_file() else []
-    session: dict[str, Any] = json.loads(lines[-1]) if lines else read_config_file(run)
-    return session
+    for line in reversed(path.read_bytes().splitlines() if path.is_file() else []):
+        try:
+            session = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if has_threads(session):
+            return dict(session)
+    content = read_config_file(run)
+    if not has_threads(content):
+        raise damaged(run / "config.json", "it does not tell the machine's threads")
+    return content
+
+
+def has_threads(session: object) -> bool:
+    machine = session.get("machine") if isinstance(session, dict) else None
+    threads = machine.get("threads") if isinstance(machine, dict) else None
+    return type(threads) is int and threads > 0
 
 
 def is_finished(run: Path) -> bool:
@@ -111,16 +139,21 @@ class Logs:
             "episodes.csv": ",".join(EPISODE_COLUMNS) + "\n",
             "evaluations.csv": ",".join(evaluation_columns(evaluation_episodes)) + "\n",
             "metrics.jsonl": "",
+            "q_bias.csv": ",".join(Q_BIAS_COLUMNS) + "\n",
         }
         for name in LOGS:
             file = (run / name).open("r+" if (run / name).exists() else "w+", newline="")
-            position = 0 if positions is None else positions[name]
+            position = 0 if positions is None else positions.get(name, 0)
             if os.fstat(file.fileno()).st_size < position:
-                raise UserError(f"{run / name} is shorter than the checkpoint remembers: the run cannot be continued")
+                raise UserError(
+                    f"{run / name} is shorter than the checkpoint remembers, so the run cannot be continued: restore "
+                    "the file, or remove the folder and train again"
+                )
             file.truncate(position)
             file.seek(position)
             if position == 0:
                 file.write(headers[name])
+                file.flush()
             self.files[name] = file
 
     def episode(self, *row: object) -> None:
@@ -129,6 +162,9 @@ class Logs:
     def evaluation(self, *row: object) -> None:
         csv.writer(self.files["evaluations.csv"], lineterminator="\n").writerow(row)
         self.flush()
+
+    def q_bias(self, *row: object) -> None:
+        csv.writer(self.files["q_bias.csv"], lineterminator="\n").writerow(row)
 
     def metrics(self, values: dict[str, float | int]) -> None:
         self.files["metrics.jsonl"].write(json.dumps(values) + "\n")
@@ -163,32 +199,46 @@ class RunRecord(NamedTuple):
     """The columns of EPISODE_COLUMNS, episodes of the random steps left out."""
     metrics: dict[str, np.ndarray]
     """updates, steps, seconds and the fields of Metrics, each averaged over a window of updates."""
+    q_bias: dict[str, np.ndarray]
+    """The columns of Q_BIAS_COLUMNS; empty arrays if it was not measured."""
     result: dict[str, Any] | None
     """result.json of a finished run."""
 
 
 def read_run(run: Path) -> RunRecord:
-    """Read a run folder, finished or not; raises UserError if it is not one."""
+    """Read a run folder, finished or not; raises UserError if it is not one or a file in it is damaged."""
     content = read_config_file(run)
-    evaluations = read_csv(run / "evaluations.csv")
+    evaluations = readable(read_csv, run / "evaluations.csv")
     for field, prefix in (("returns", "return_"), ("lengths", "length_")):
         columns = [evaluations.pop(name) for name in list(evaluations) if name.startswith(prefix)]
         evaluations[field] = np.stack(columns, axis=1) if columns else np.zeros((0, 0))
-    episodes = read_csv(run / "episodes.csv")
+    episodes = readable(read_csv, run / "episodes.csv")
     if episodes:
         learning = episodes["episode"] > 0
         episodes = {name: column[learning] for name, column in episodes.items()}
-    result = run / "result.json"
     return RunRecord(
         path=run,
-        config=Config.from_dict(content["config"]),
+        config=config_of(run, content),
         versions=content["versions"],
         machine=content["machine"],
         evaluations=evaluations,
         episodes=episodes,
-        metrics=read_json_lines(run / "metrics.jsonl"),
-        result=json.loads(result.read_text()) if result.is_file() else None,
+        metrics=readable(read_json_lines, run / "metrics.jsonl"),
+        q_bias=readable(read_csv, run / "q_bias.csv"),
+        result=readable(read_json, run / "result.json") if is_finished(run) else None,
     )
+
+
+def readable(read: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any]:
+    """What `read` makes of a file; raises UserError if it cannot."""
+    try:
+        return read(path)
+    except (KeyError, RecursionError, TypeError, ValueError) as error:
+        raise damaged(path, error) from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    return dict(json.loads(path.read_text()))
 
 
 def read_csv(path: Path) -> dict[str, np.ndarray]:
@@ -196,6 +246,8 @@ def read_csv(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         return {}
     whole = path.read_text().rpartition("\n")[0]
+    if not whole:
+        return {}
     header, *rows = csv.reader(whole.splitlines())
     table = np.array([[float(value) for value in row] for row in rows], np.float64).reshape(len(rows), len(header))
     return {name: table[:, index] for index, name in enumerate(header)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-STREAMS = ("learner", "environments", "exploration", "replay", "evaluation")
+STREAMS = ("learner", "environments", "exploration", "replay", "evaluation", "q_bias")
 
 
 def stream(seed: int, name: str, index: int = 0) -> np.random.SeedSequence:
@@ -17,8 +17,8 @@ def integers(seed: int, name: str, count: int, index: int = 0) -> list[int]:
     return [int(value) for value in stream(seed, name, index).generate_state(count)]
 
 
-def generator(seed: int, name: str) -> np.random.Generator:
-    return np.random.Generator(np.random.PCG64(stream(seed, name)))
+def generator(seed: int, name: str, index: int = 0) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(stream(seed, name, index)))
 
 
 def learner_key(seed: int) -> np.ndarray:

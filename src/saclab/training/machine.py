@@ -1,0 +1,63 @@
+"""What could make the same configuration give other bits: versions and machine, recorded and compared at resume."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("saclab", "jax", "jaxlib", "numpy", "optax", "gymnasium", "mujoco")
+HOW_TO_MATCH = {
+    "threads": "continue exactly with --threads {0} (or NPROC={0} in the environment)",
+    "numpy_threads": "continue exactly with OPENBLAS_NUM_THREADS={0} in the environment (--threads sets it too)",
+    "xla_flags": "continue exactly with XLA_FLAGS={0!r} in the environment",
+}
+
+
+def machine_facts() -> dict[str, Any]:
+    """The versions and the machine of this process."""
+    return {
+        "versions": {package: version(package) for package in PACKAGES} | {"python": platform.python_version()},
+        "machine": {
+            "system": platform.platform(),
+            "processor": processor_name(),
+            "threads": visible_threads("NPROC"),
+            "numpy_threads": visible_threads("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"),
+            "xla_flags": os.environ.get("XLA_FLAGS", ""),
+        },
+    }
+
+
+def visible_threads(*variables: str) -> int:
+    """Threads that XLA (NPROC) or NumPy uses on the CPU: the results depend on their number."""
+    for variable in variables:
+        if (value := os.environ.get(variable, "")).isdecimal() and int(value) > 0:
+            return int(value)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def processor_name() -> str:
+    """The model, as compilers choose instructions by it; the architecture where the system does not tell more."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text(errors="replace").splitlines() if information.exists() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.machine()
+
+
+def different_facts(saved: object) -> list[str]:
+    """Warnings for each version or machine fact that is not what a checkpoint was made with."""
+    warnings = []
+    for part, now in machine_facts().items():
+        then = saved.get(part) if isinstance(saved, dict) else None
+        for name, value in now.items():
+            before = then.get(name) if isinstance(then, dict) else None
+            if before == value:
+                continue
+            way_out = "; " + HOW_TO_MATCH[name].format(before) if name in HOW_TO_MATCH and before is not None else ""
+            warnings.append(
+                f"{name} was {'not recorded' if before is None else before} when the checkpoint was made and is "
+                f"{value!s} now: results may differ in the last bits{way_out}"
+            )
+    return warnings

@@ -1,0 +1,122 @@
+"""How far the critics are from the truth: their Q against Monte-Carlo soft returns from the same states and actions.
+
+The measure of Chen et al. 2021 ("Randomized Ensembled Double Q-Learning", section 3): the normalised bias
+(Q(s, a) − G) / |mean of G|, its mean and its standard deviation over the state-action pairs of a few episodes of the
+policy. G is the soft return that SAC's Q stands for (Eq. 1, Eq. 4): the reward, then the discounted rewards and
+entropy bonuses that follow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saclab.algorithm.networks import Network
+from saclab.algorithm.policy import Policy
+from saclab.environments.make import EnvironmentSpec
+
+NEGLIGIBLE = 0.01  # weight γ^n below which what follows a cut-off state is left out
+
+
+class Critics(NamedTuple):
+    """What is judged, on the host."""
+
+    policy: Policy
+    actor: np.ndarray
+    """f32[P]."""
+    q_network: Network
+    critic: np.ndarray
+    """f32[C, P]."""
+    alpha: float
+    discount: float
+
+    def q(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
+        """The smallest of the critics, as the policy sees it: f32[n] for f32[n, O] and f32[n, A]."""
+        inputs = np.concatenate([observation, action], axis=1)
+        smallest: np.ndarray = np.min([self.q_network.apply(row, inputs)[:, 0] for row in self.critic], axis=0)
+        return smallest
+
+
+class QBias(NamedTuple):
+    """NaN where no state has a known return."""
+
+    pairs: int
+    """State-action pairs that were compared."""
+    mean_q: float
+    mean_return: float
+    """Of the Monte-Carlo soft returns."""
+    mean_bias: float
+    """Mean of (Q − G) / |mean of G|."""
+    bias_spread: float
+    """Its standard deviation over the pairs."""
+
+
+class Episode(NamedTuple):
+    observation: np.ndarray
+    """f32[T, O]."""
+    action: np.ndarray
+    """f32[T, A]."""
+    reward: np.ndarray
+    """f64[T]."""
+    log_prob: np.ndarray
+    """f64[T]."""
+    terminated: bool
+
+
+def measure_q_bias(
+    critics: Critics,
+    environment: Any,
+    spec: EnvironmentSpec,
+    seeds: Sequence[int],
+    generator: np.random.Generator,
+) -> QBias:
+    """Play one episode per seed with the stochastic policy, and compare."""
+    episodes = [play(critics, environment, spec, seed, generator) for seed in seeds]
+    known = [known_returns(episode, critics.alpha, critics.discount) for episode in episodes]
+    returns = np.concatenate(known)
+    q = np.concatenate([
+        critics.q(episode.observation[: len(part)], episode.action[: len(part)])
+        for episode, part in zip(episodes, known, strict=True)
+    ])  # fmt: skip
+    if len(returns) == 0:
+        return QBias(0, math.nan, math.nan, math.nan, math.nan)
+    bias = (q - returns) / max(abs(float(returns.mean())), 1e-8)
+    return QBias(len(returns), float(q.mean()), float(returns.mean()), float(bias.mean()), float(bias.std()))
+
+
+def play(
+    critics: Critics, environment: Any, spec: EnvironmentSpec, seed: int, generator: np.random.Generator
+) -> Episode:
+    """One episode of the stochastic policy."""
+    observation, _ = environment.reset(seed=seed)
+    rows: list[tuple[np.ndarray, np.ndarray, float, float]] = []
+    act: Callable[..., tuple[np.ndarray, np.ndarray]] = critics.policy.sample
+    while True:
+        seen = np.asarray(observation, np.float32)[None]
+        noise = generator.standard_normal((1, spec.action_size), np.float32)
+        action, log_prob = act(critics.actor, seen, noise)
+        observation, reward, terminated, truncated, _ = environment.step(spec.scale_action(action)[0])
+        rows.append((seen[0], action[0], float(reward), float(log_prob[0])))
+        if terminated or truncated:
+            break
+    observations, actions, rewards, log_probs = (np.array(column) for column in zip(*rows, strict=True))
+    return Episode(observations, actions, rewards, log_probs, bool(terminated))
+
+
+def known_returns(episode: Episode, alpha: float, discount: float) -> np.ndarray:
+    """Soft returns f64[n] of the first n steps: G_t = r_t + γ (G_{t+1} − α log π(a_{t+1}|s_{t+1})).
+
+    All of an episode that ended in a terminal state are known. One that was cut off by a time limit says nothing of
+    what would have followed, so only its steps count from where on that has a negligible weight.
+    """
+    returns = np.zeros(len(episode.reward) + 1)
+    bonus = np.append(-alpha * episode.log_prob, 0.0)
+    for step in reversed(range(len(episode.reward))):
+        returns[step] = episode.reward[step] + discount * (returns[step + 1] + bonus[step + 1])
+    if episode.terminated:
+        return returns[:-1]
+    cut = math.ceil(math.log(NEGLIGIBLE) / math.log(discount)) if discount > 0 else 1
+    return returns[: max(0, len(episode.reward) - cut)]

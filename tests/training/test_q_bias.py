@@ -1,0 +1,90 @@
+"""The critics' bias against soft returns worked out by hand, and that measuring it leaves training as it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from saclab.algorithm.learner import make_learner
+from saclab.config import AlgorithmSettings
+from saclab.environments.make import environment_spec, make_environment
+from saclab.protocols import make_config
+from saclab.training.loop import train
+from saclab.training.q_bias import Critics, Episode, QBias, known_returns, measure_q_bias
+from saclab.training.run_folder import Q_BIAS_COLUMNS, read_run
+
+
+def episode(rewards: list[float], log_probs: list[float], terminated: bool) -> Episode:
+    steps = len(rewards)
+    return Episode(np.zeros((steps, 1)), np.zeros((steps, 1)), np.array(rewards), np.array(log_probs), terminated)
+
+
+def test_soft_returns_by_hand() -> None:
+    # G_2 = 4;  G_1 = 2 + 0.5 (4 - 0.1 * 3) = 3.85;  G_0 = 1 + 0.5 (3.85 - 0.1 * 2) = 2.825
+    returns = known_returns(episode([1, 2, 4], [9, 2, 3], terminated=True), alpha=0.1, discount=0.5)
+    np.testing.assert_allclose(returns, [2.825, 3.85, 4.0])
+
+
+def test_the_entropy_of_the_first_action_is_not_part_of_its_own_q() -> None:
+    changed = known_returns(episode([1, 2], [100, 2], terminated=True), alpha=0.1, discount=0.5)
+    np.testing.assert_array_equal(changed, known_returns(episode([1, 2], [9, 2], True), alpha=0.1, discount=0.5))
+
+
+def test_steps_near_a_time_limit_are_left_out() -> None:
+    # 0.5^7 < 0.01: the last seven steps of an episode that was cut off have unknown returns
+    assert len(known_returns(episode([1.0] * 20, [0.0] * 20, terminated=False), 0.1, 0.5)) == 13
+    assert len(known_returns(episode([1.0] * 5, [0.0] * 5, terminated=False), 0.1, 0.5)) == 0
+    assert len(known_returns(episode([1.0] * 5, [0.0] * 5, terminated=True), 0.1, 0.5)) == 5
+
+
+def pendulum_bias(discount: float, shift: float) -> QBias:
+    """The bias of random critics whose output bias is moved by `shift`."""
+    settings = AlgorithmSettings(hidden_layers=(8,), discount=discount)
+    environment = make_environment("Pendulum-v1")
+    spec = environment_spec("Pendulum-v1", environment)
+    learner = make_learner(settings, spec.observation_size, spec.action_size)
+    state = learner.init(jax.random.PRNGKey(0))
+    critic = np.array(state.critic)
+    critic[:, -1] += shift  # the last parameter is the output's bias
+    critics = Critics(learner.policy, np.array(state.actor), learner.q_network, critic, 0.2, discount)
+    return measure_q_bias(critics, environment, spec, [1, 2], np.random.default_rng(0))
+
+
+def test_moving_q_moves_the_bias_by_as_much_over_the_mean_return() -> None:
+    low, high = pendulum_bias(0.9, 0.0), pendulum_bias(0.9, 3.0)
+    assert high.mean_q - low.mean_q == pytest.approx(3.0, rel=1e-4)
+    assert high.mean_bias - low.mean_bias == pytest.approx(3.0 / abs(low.mean_return), rel=1e-4)
+    assert high.bias_spread == pytest.approx(low.bias_spread, rel=1e-3)
+
+
+def test_no_known_return_gives_nan_and_no_pairs() -> None:
+    bias = pendulum_bias(0.99, 0.0)  # 459 steps would have to follow, and Pendulum's episodes have 200
+    assert bias.pairs == 0
+    assert math.isnan(bias.mean_bias)
+
+
+def test_columns_are_the_fields() -> None:
+    assert Q_BIAS_COLUMNS[4:-1] == QBias._fields
+
+
+def test_measuring_is_logged_and_leaves_training_as_it_is(tmp_path: Path) -> None:
+    settings = {
+        "hidden_layers": (8,), "batch_size": 16, "random_steps": 100, "max_updates": 200, "discount": 0.9,
+        "evaluation_interval_steps": 200, "evaluation_episodes": 1,
+    }  # fmt: skip
+    plain = make_config("Pendulum-v1", "sac", "quick", overrides=settings)
+    measured = dataclasses.replace(plain, training=dataclasses.replace(plain.training, q_bias_episodes=1))
+    for config, folder in ((plain, tmp_path / "plain"), (measured, tmp_path / "measured")):
+        for _ in train(config, folder):
+            pass
+    without, with_bias = read_run(tmp_path / "plain"), read_run(tmp_path / "measured")
+    np.testing.assert_array_equal(without.evaluations["returns"], with_bias.evaluations["returns"])
+    np.testing.assert_array_equal(without.episodes["return"], with_bias.episodes["return"])
+    assert len(without.q_bias["pairs"]) == 0
+    np.testing.assert_array_equal(with_bias.q_bias["evaluation"], with_bias.evaluations["evaluation"])
+    assert (with_bias.q_bias["pairs"] == 200 - 44).all()  # 0.9^44 < 0.01

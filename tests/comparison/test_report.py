@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from saclab.comparison import figures
 from saclab.comparison.commands import train_command
 from saclab.comparison.page import ALL_VIDEO_BYTES, VIDEO_BYTES
 from saclab.comparison.page_data import script_safe
@@ -20,6 +21,14 @@ from saclab.training.run_folder import read_run
 from .synthetic import write_run
 
 HOSTILE = "</script><script>boom()</script><!--<img src=x onerror=boom()>\"'`|$\\frac{&amp;\ud800\u2028\x00"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def coarse_pictures():
+    """Figures of few dots: here only their making is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "DOTS_PER_INCH", 40)
+        yield
 
 
 class Page(HTMLParser):
@@ -216,6 +225,8 @@ def test_short_runs_and_missing_metrics_work(tmp_path, options):
     runs = [write_run(tmp_path, variant, **options) for variant in ("sac", "averaged")]
     page = Page(write_report(runs, tmp_path / "out").read_text())
     assert "Summary" in page.words
+    assert "Probability that a run of the row" not in page.words  # one seed each: such a number would say nothing
+    assert not list((tmp_path / "out" / "figures").glob("improvement-*"))
     if not options.get("finished", True):
         assert "2 of 2 runs unfinished" in page.words
 

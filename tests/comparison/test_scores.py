@@ -87,8 +87,20 @@ def test_few_seeds_are_warned_of(tmp_path):
 def test_one_seed_says_that_no_interval_exists(tmp_path):
     folders = [write_run(tmp_path, variant) for variant in ("sac", "averaged")]
     sentences = environment_sentences(scores_of(folders))
+    assert len(sentences) == 2
     assert "with one seed each no interval exists" in sentences[0]
     assert not any("beats" in sentence for sentence in sentences)
+
+
+def test_many_pairs_without_an_interval_take_one_sentence(tmp_path):
+    folders = [write_run(tmp_path, variant) for variant in ("sac", "sac-auto", "averaged")]
+    first, *others = environment_sentences(scores_of(folders))
+    assert first.startswith("One seed only of sac, sac-auto and averaged: no interval exists")
+    assert len(others) == 1
+    folders += [write_run(tmp_path, variant, 1) for variant in ("sac", "averaged")]
+    known, unknown, *_ = environment_sentences(scores_of(folders))
+    assert "2 seeds cannot tell" in known
+    assert unknown.startswith("One seed only of sac-auto: ")
 
 
 def test_aggregate_normalises_each_environment(tmp_path):

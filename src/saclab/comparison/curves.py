@@ -52,6 +52,10 @@ DIAGNOSTICS = (
     Quantity("snapshot_spread", "snapshot spread", "metrics", "snapshot_spread", "updates",
              "standard deviation between the K target snapshots' values; 0 for K = 1: "
              "how much there is to average (Eq. 9)"),
+    Quantity("q_bias", "Q bias", "q_bias", "mean_bias", "updates",
+             "(Q − Monte-Carlo soft return) / |mean return|; above 0 the critics overestimate"),
+    Quantity("q_bias_spread", "Q bias, spread", "q_bias", "bias_spread", "updates",
+             "standard deviation of the Q bias over states"),
 )  # fmt: skip
 
 
@@ -110,6 +114,12 @@ def gather_curves(comparison: Comparison) -> Curves:
                 if runs:
                     gathered[environment, arm, quantity.key] = ArmCurves(runs, band(list(runs.values())))
     return gathered
+
+
+def logged(curves: Curves, environment: str, quantities: Sequence[Quantity]) -> tuple[Quantity, ...]:
+    """The quantities that at least one run of an environment has."""
+    keys = {key for name, _, key in curves if name == environment}
+    return tuple(quantity for quantity in quantities if quantity.key in keys)
 
 
 def series(run: RunRecord, quantity: Quantity) -> Series | None:

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from saclab.comparison.curves import AXES, DIAGNOSTICS, PAPER_PANELS, ArmCurves, Curves, Quantity
+from saclab.comparison.curves import AXES, DIAGNOSTICS, PAPER_PANELS, ArmCurves, Curves, Quantity, logged
 from saclab.comparison.runs import Arm, Comparison, all_notices, notices, shown
 from saclab.comparison.scores import AggregateScores, EnvironmentScores, Pair, number_text
 from saclab.comparison.statistics import Band, Interval
@@ -25,6 +25,7 @@ from saclab.paper import paper_curves
 from saclab.training.run_folder import safe_name
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DOTS_PER_INCH = 150
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 STYLE: Any = {
     "font.size": 9,
@@ -54,9 +55,10 @@ def write_figures(
         for number, entry in enumerate(scores):
             name = file_name(entry.environment, number)
             runs = comparison.runs_of(entry.environment)
+            diagnostics = logged(curves, entry.environment, DIAGNOSTICS)
             figures = {
                 "panels": draw_curves(curves, entry.environment, PAPER_PANELS, styles),
-                "diagnostics": draw_curves(curves, entry.environment, DIAGNOSTICS, styles),
+                "diagnostics": draw_curves(curves, entry.environment, diagnostics, styles),
                 "intervals": draw_scores(entry, styles),
                 "improvement": draw_pairs(entry.pairs, shown(entry.environment)),
                 "profiles": draw_profiles(
@@ -86,7 +88,7 @@ def save(figure: Figure | None, path: Path, said: Sequence[str]) -> list[Path]:
         figure.supxlabel(text, fontsize=8, color="#8a3b00", fontweight="bold")
     FigureCanvasAgg(figure)
     for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-        figure.savefig(path.with_name(f"{path.name}.{suffix}"), dpi=150, metadata=metadata)
+        figure.savefig(path.with_name(f"{path.name}.{suffix}"), dpi=DOTS_PER_INCH, metadata=metadata)
         figure.set_layout_engine("none")  # the second file keeps the layout of the first, which is slow to find
     return [path.with_name(f"{path.name}.png")]
 
@@ -110,8 +112,12 @@ def marker_style(index: int, points: int = 1) -> dict[str, Any]:
     }
 
 
-def draw_curves(curves: Curves, environment: str, quantities: Sequence[Quantity], styles: dict[Arm, int]) -> Figure:
+def draw_curves(
+    curves: Curves, environment: str, quantities: Sequence[Quantity], styles: dict[Arm, int]
+) -> Figure | None:
     """One panel per quantity: each seed as a thin line, the interquartile mean with its 95 % band."""
+    if not quantities:
+        return None
     rows = -(-len(quantities) // 2)
     figure = new_figure(10, 1.2 + 2.9 * rows)
     panels = list(figure.subplots(rows, 2, squeeze=False).flat)
@@ -205,7 +211,11 @@ def set_arm_rows(panel: Any, names: Sequence[str]) -> None:
 
 
 def draw_pairs(pairs: Sequence[Pair], title: str) -> Figure | None:
-    """The matrix of P(row beats column) by final return, with intervals; bold where the interval excludes ½."""
+    """The matrix of P(row beats column) by final return, with intervals; bold where the interval excludes ½.
+
+    Pairs without an interval are left out: their number says nothing.
+    """
+    pairs = [pair for pair in pairs if pair.improvement.exists]
     if not pairs:
         return None
     arms = list(dict.fromkeys(arm for pair in pairs for arm in (pair.x, pair.y)))
@@ -219,7 +229,7 @@ def draw_pairs(pairs: Sequence[Pair], title: str) -> Figure | None:
         row, column = place[pair.x], place[pair.y]
         for i, j, estimate, bounds in ((row, column, p, (low, high)), (column, row, 1 - p, (1 - high, 1 - low))):
             matrix[i, j] = estimate
-            text = f"{estimate:.2f}\n" + ("no interval" if np.isnan(low) else f"[{bounds[0]:.2f}, {bounds[1]:.2f}]")
+            text = f"{estimate:.2f}\n[{bounds[0]:.2f}, {bounds[1]:.2f}]"
             panel.text(
                 j,
                 i,

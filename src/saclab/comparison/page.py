@@ -100,10 +100,10 @@ def bullets(sentences: Sequence[str]) -> str:
 
 def environment_section(entry: EnvironmentScores, number: int) -> str:
     """Table, curves, intervals, pairs and diagnostics of one environment; the script fills the empty elements."""
-    name = escape(shown(entry.environment))
+    name, table = escape(shown(entry.environment)), scores_table(entry)
     return f"""<section class="environment" id="environment-{number}">
 <h2>{name}</h2>
-{table_html(scores_table(entry), headed=True)}
+{table_html(table if number == 0 else table._replace(note=""), headed=True)}
 <h3>Learning curves</h3><div class="charts" data-environment="{number}" data-draw="curves"></div>
 <h3>Scores with intervals</h3><div class="charts" data-environment="{number}" data-draw="intervals"></div>
 {pairs_html(entry.pairs)}
@@ -145,7 +145,8 @@ def unbroken(text: str) -> str:
 
 
 def pairs_html(pairs: Sequence[Pair]) -> str:
-    """The matrix of P(row ends higher than column), with what equal seeds say below each."""
+    """The matrix of P(row ends higher than column), with what equal seeds say below each; where intervals exist."""
+    pairs = [pair for pair in pairs if pair.improvement.exists]
     if not pairs:
         return ""
     arms = list(dict.fromkeys(arm for pair in pairs for arm in (pair.x, pair.y)))
@@ -172,15 +173,12 @@ def pair_cell(pair: Pair, flipped: bool) -> str:
     if flipped:
         p, low, high, runs_x, runs_y = 1 - p, 1 - high, 1 - low, runs_y, runs_x
         same_seed, same_low, same_high = 1 - same_seed, 1 - same_high, 1 - same_low
-    bounds = f"[{low:.2f}, {high:.2f}]" if low == low else "no interval"
     seeds = f"{runs_x} against {runs_y} seeds"
     if count:
         paired_bounds = f" [{same_low:.2f}, {same_high:.2f}]" if same_low == same_low else ", no interval"
         seeds += f"; equal seeds {same_seed:.2f}{paired_bounds}, {count_text(count, 'pair')}"
-    shade = f"shade-{min(9, int(10 * p))}"
-    return (
-        f'<td class="{shade}{" clear" * pair.improvement.decided}">{p:.2f} {bounds}<small>{escape(seeds)}</small></td>'
-    )
+    style = f"shade-{min(9, int(10 * p))}{' clear' * pair.improvement.decided}"
+    return f'<td class="{style}">{unbroken(f"{p:.2f} [{low:.2f}, {high:.2f}]")}<small>{unbroken(seeds)}</small></td>'
 
 
 def videos(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from saclab.comparison.curves import AXES, DIAGNOSTICS, PAPER_PANELS, Curves, Quantity
+from saclab.comparison.curves import AXES, DIAGNOSTICS, PAPER_PANELS, Curves, Quantity, logged
 from saclab.comparison.runs import Arm, Comparison, shown
 from saclab.comparison.scores import AggregateScores, EnvironmentScores
 from saclab.comparison.statistics import Band, Interval
@@ -74,9 +74,9 @@ def environment_data(
     comparison: Comparison, entry: EnvironmentScores, curves: Curves, places: dict[Arm, int], pool: AxisPool
 ) -> dict[str, Any]:
     name = entry.environment
-    quantities = [(quantity, group) for group, each in (("curves", PAPER_PANELS), ("diagnostics", DIAGNOSTICS))
-                  for quantity in each]  # fmt: skip
-    panels = [panel_data(quantity, group, name, curves, places, pool) for quantity, group in quantities]
+    diagnostics = logged(curves, name, DIAGNOSTICS)
+    panels = [panel_data(quantity, "curves", name, curves, places, pool) for quantity in PAPER_PANELS]
+    panels += [panel_data(quantity, "diagnostics", name, curves, places, pool) for quantity in diagnostics]
     return {
         "name": shown(name),
         "panels": panels,

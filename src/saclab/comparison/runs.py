@@ -25,6 +25,9 @@ from saclab.variants import VARIANTS
 SIMULATION_PACKAGES = ("gymnasium", "mujoco")
 """Runs whose major versions of these differ are not comparable."""
 
+ONLY_MEASURING = ("q_bias_episodes",)
+"""Settings that change what is measured beside the training, and not its course."""
+
 
 class Arm(NamedTuple):
     """What is compared: a variant, and where differing runs stand side by side, what differs."""
@@ -139,12 +142,13 @@ def reference_run(runs: Sequence[RunRecord]) -> RunRecord:
 def signature(run: RunRecord) -> dict[str, Any]:
     """What must be equal for runs of one environment, whatever their variant and seed."""
     versions = {f"{package} version": major(run.versions.get(package)) for package in SIMULATION_PACKAGES}
+    training = {name: value for name, value in asdict(run.config.training).items() if name not in ONLY_MEASURING}
     return {
         "protocol": run.config.protocol,
         "update-to-data ratio": run.config.training.update_to_data_ratio,
         **versions,
         "environment_arguments": run.config.environment_arguments,
-        **asdict(run.config.training),
+        **training,
         **beside_variant(run.config),
     }
 

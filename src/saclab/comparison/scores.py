@@ -261,8 +261,20 @@ def aggregate_sentences(together: AggregateScores) -> list[str]:
 
 
 def pair_sentences(pairs: Sequence[Pair]) -> list[str]:
-    """Decided pairs first."""
-    return [pair.sentence for pair in sorted(pairs, key=lambda pair: not pair.improvement.decided)]
+    """Decided pairs first, then undecided ones; those that no interval exists for in one sentence."""
+    known = [pair for pair in pairs if pair.improvement.exists]
+    sentences = [pair.sentence for pair in sorted(known, key=lambda pair: not pair.improvement.decided)]
+    unknown = [pair for pair in pairs if pair not in known]
+    if len(unknown) <= 1:
+        return sentences + [pair.sentence for pair in unknown]
+    runs = {pair.x: pair.improvement.runs_x for pair in unknown} | {pair.y: pair.improvement.runs_y for pair in unknown}
+    *others, last = [arm.name for arm, count in runs.items() if count < 2]
+    alone = f"{', '.join(others)} and {last}" if others else last
+    return [
+        *sentences,
+        f"One seed only of {alone}: no interval exists, so nothing can be said about which is better. In one "
+        "environment it takes at least four seeds of each to decide anything.",
+    ]
 
 
 def interval_text(interval: Interval) -> str:

@@ -63,6 +63,11 @@ class Improvement(NamedTuple):
     """The same over runs of equal seed only; `runs` counts the pairs, NaN if there is none."""
 
     @property
+    def exists(self) -> bool:
+        """Whether there is an interval, without which the estimate says nothing."""
+        return not np.isnan(self.low)
+
+    @property
     def decided(self) -> bool:
         """Whether the interval excludes ½."""
         return self.low > 0.5 or self.high < 0.5

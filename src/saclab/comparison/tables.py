@@ -52,7 +52,7 @@ def scores_table(entry: EnvironmentScores) -> Table:
 
 def interval_cell(interval: Interval) -> str:
     """An interval without its number of runs, which stands in a column of its own."""
-    return re.sub(r", \d+ seeds$", "", interval_text(interval))
+    return re.sub(r", \d+ seeds$|: 1 seed(?=\)$)", "", interval_text(interval))
 
 
 def settings_table(comparison: Comparison) -> Table:

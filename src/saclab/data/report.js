@@ -31,7 +31,7 @@
     return `${+value.toPrecision(3)}`;
   };
   const exact = (value) => (value === null || value === undefined ? "–" : Math.abs(value) >= 100
-    ? Math.round(value).toLocaleString("en") : `${+value.toPrecision(4)}`);
+    ? Math.round(value).toLocaleString("en") : `${+value.toPrecision(3)}`);
 
   function ticks(low, high, count) {
     const rough = (high - low) / Math.max(1, count), power = 10 ** Math.floor(Math.log10(rough));
@@ -54,12 +54,12 @@
     return [low, high];
   }
 
-  function path(x, y, scaleX, scaleY, step) {
+  function path(x, y, scaleX, scaleY) {
     let text = "", open = false;
     for (let i = 0; i < y.length; i += 1) {
       if (y[i] === null || x[i] === null) { open = false; continue; }
       const px = scaleX(x[i]).toFixed(1), py = scaleY(y[i]).toFixed(1);
-      text += open ? (step ? `H${px}V${py}` : `L${px} ${py}`) : `M${px} ${py}`;
+      text += `${open ? "L" : "M"}${px} ${py}`;
       open = true;
     }
     return text;
@@ -116,7 +116,7 @@
     }
     for (const line of paper) picture.append(svg("path", { class: `paper ${colour(line.arm)}`, d: path(line.x, line.y, scaleX, scaleY) }));
     for (const arm of chart.arms) {
-      picture.append(svg("path", { class: `middle ${colour(arm.arm)}`, d: path(arm.x, arm.middle, scaleX, scaleY, chart.step) }));
+      picture.append(svg("path", { class: `middle ${colour(arm.arm)}`, d: path(arm.x, arm.middle, scaleX, scaleY) }));
       const every = Math.max(1, Math.floor(arm.x.length / 7));
       for (let i = Math.min(arm.x.length - 1, arm.arm * Math.max(1, Math.floor(every / 4))); i < arm.x.length; i += every) {
         if (arm.middle[i] !== null) picture.append(svg("path", { class: `marker ${colour(arm.arm)}`, d: shape(arm.arm),
@@ -141,7 +141,7 @@
         if (!arm.x.length || target > arm.x[arm.x.length - 1] * 1.02) continue;
         const i = nearest(arm.x, target);
         const interval = arm.low ? ` [${exact(arm.low[i])}, ${exact(arm.high[i])}]` : "";
-        const entry = html("div", { class: colour(arm.arm) }, `${data.arms[arm.arm].title}: ${exact(arm.middle[i])}${interval}, n = ${arm.count}`);
+        const entry = html("div", { class: colour(arm.arm) }, `${data.arms[arm.arm].title}: ${exact(arm.middle[i])}${interval}, n\u00a0=\u00a0${arm.count}`);
         readout.append(entry);
       }
       for (const line of chart.paper) {
@@ -197,9 +197,9 @@
       for (const run of row.runs) nodes.push(svg("line", { class: "tick", x1: scale(run), x2: scale(run), y1: 5, y2: 17 }));
       nodes.push(svg("path", { class: `marker ${colour(row.arm)}`, d: shape(row.arm), transform: `translate(${scale(row.estimate)} 11) scale(1.3)` }));
       if (row.paper !== null) nodes.push(svg("path", { class: "reference", d: SHAPES[3], transform: `translate(${scale(row.paper)} 11) scale(1.3)` }));
-      const interval = row.low === null ? "no interval" : `[${exact(row.low)}, ${exact(row.high)}]`;
-      const paper = row.paper === null ? "" : ` · ◇ paper ${exact(row.paper)}`;
-      figure.append(html("div", { class: "row" }, `${data.arms[row.arm].title}: ${exact(row.estimate)} ${interval}, n = ${row.count}${paper}`), strip(22, ...nodes));
+      const interval = row.low === null ? ", no interval" : ` [${exact(row.low)}, ${exact(row.high)}]`;
+      const paper = row.paper === null ? "" : ` · ◇\u00a0paper\u00a0${exact(row.paper)}`;
+      figure.append(html("div", { class: "row" }, `${data.arms[row.arm].title}: ${exact(row.estimate)}${interval}, n\u00a0=\u00a0${row.count}${paper}`), strip(22, ...nodes));
     }
     figure.append(strip(24, ...marks.map((value) => svg("text", { x: scale(value), y: 16, "text-anchor": "middle" }, short(value)))));
   }
@@ -218,10 +218,14 @@
   }
 
   function profileChart(profile) {
+    // A share changes in steps: every point but the first comes twice, first with the value before it.
+    const twice = (values) => values.flatMap((value) => [value, value]);
+    const x = twice(profile.x).slice(1), steps = (values) => (values ? twice(values).slice(0, -1) : null);
     const arms = profile.arms.filter((arm) => state.arms.has(arm.arm)).map((arm) => ({
-      arm: arm.arm, count: arm.count, x: profile.x, middle: arm.middle, low: state.bands ? arm.low : null, high: arm.high, runs: [],
+      arm: arm.arm, count: arm.count, x, middle: steps(arm.middle),
+      low: state.bands ? steps(arm.low) : null, high: steps(arm.high), runs: [],
     }));
-    return { title: "share of runs above", titleX: profile.title, arms, paper: [], step: true };
+    return { title: "share of runs above a score", titleX: profile.title, arms, paper: [] };
   }
 
   const figures = [];
@@ -236,7 +240,8 @@
   for (const host of document.querySelectorAll("[data-draw]")) {
     const source = host.dataset.environment === "together" ? data.together : data.environments[Number(host.dataset.environment)];
     const kind = host.dataset.draw;
-    if (kind === "profile") chartFigure(host, "share of runs above a score", "further right is better", (figure) => lineChart(figure, profileChart(source.profile)));
+    if (source.panels && kind === "diagnostics" && !source.panels.some((panel) => panel.group === kind)) host.append("Nothing logged so far.");
+    else if (kind === "profile") chartFigure(host, `by ${source.profile.title}`, "further right is better", (figure) => lineChart(figure, profileChart(source.profile)));
     else if (kind === "intervals") for (const chart of source.intervals) chartFigure(host, chart.title, "", (figure) => intervalChart(figure, chart));
     else for (const panel of source.panels) if (panel.group === kind) chartFigure(host, panel.title, panel.meaning, (figure) => lineChart(figure, panelChart(panel)));
   }

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 
 from saclab.environments.make import make_environment
@@ -65,20 +64,35 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int) -> str:
         environment = make_environment(description["environment"], sized, render_mode="rgb_array")
     except UserError:  # not every environment can be told a size
         environment = make_environment(description["environment"], arguments, render_mode="rgb_array")
+    environment.reset(seed=seed)
+    require_rendering(environment, description["environment"])
     frames_per_second = environment.metadata.get("render_fps", 30)
     video.parent.mkdir(parents=True, exist_ok=True)
     partial = video.with_name(video.stem + ".partial" + video.suffix)
     try:
         with imageio.get_writer(partial, fps=frames_per_second, macro_block_size=2, quality=6) as writer:
             total_reward, filmed = film(environment, policy, writer, steps, seed)
-    except gymnasium.error.DependencyNotInstalled as error:
-        raise UserError(f"{description['environment']} cannot be filmed: {error}") from error
     except ValueError as error:
         raise UserError(f"video = {str(video)!r}: {error}; use a name that ends in .mp4") from error
     finally:
         environment.close()
     partial.replace(video)
     return f"{video}: {filmed} steps, return {total_reward:.1f} until then"
+
+
+def require_rendering(environment: Any, name: str) -> None:
+    """Raise UserError, with what the renderer said, unless it can draw a frame."""
+    try:
+        frame = environment.render()
+    except Exception as error:  # renderers fail in ways of their own: a missing library, package, display or driver
+        environment.close()
+        raise UserError(
+            f"{name} cannot be filmed here: {error}; without a screen MuJoCo needs EGL (Debian: libegl1 and "
+            "libgl1-mesa-dri) and MUJOCO_GL=egl"
+        ) from error
+    if not isinstance(frame, np.ndarray):
+        environment.close()
+        raise UserError(f"{name} cannot be filmed: its frames are {type(frame).__name__}, not arrays of pixels")
 
 
 def film(environment: Any, policy: TrainedPolicy, writer: Any, steps: int, seed: int) -> tuple[float, int]:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from ctypes.util import find_library
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,22 @@ def test_evaluate_prints_the_return_of_the_best_policy(trained: Path) -> None:
     told = json.loads(result.stdout)
     assert len(told["total_rewards"]) == 3
     assert told["mean_return"] == pytest.approx(np.mean(told["total_rewards"]))
+
+
+@pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library to render with")
+def test_record_films_the_best_policy_without_a_screen(tmp_path: Path) -> None:
+    trained = saclab(
+        "train", "Hopper-v4", "--protocol", "quick", *SMALL, "--max-updates", "20", "--evaluation-episodes", "1",
+        folder=tmp_path,
+    )  # fmt: skip
+    assert trained.returncode == 0, trained.stderr
+    run = tmp_path / "runs/Hopper-v4/sac-auto/quick/seed-0"
+    filmed = saclab("record", str(run), "--video", "hopper.mp4", "--steps", "5", "--size", "64", folder=tmp_path)
+    assert filmed.returncode == 0, filmed.stderr
+    assert (tmp_path / "hopper.mp4").read_bytes()[4:8] == b"ftyp"
+    refused = saclab("record", str(run), "--video", "hopper.xyz", "--steps", "5", "--size", "64", folder=tmp_path)
+    assert refused.returncode == 2
+    assert "hopper.xyz" in refused.stderr
 
 
 def test_report_reads_run_folders(trained: Path) -> None:

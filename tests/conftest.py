@@ -49,14 +49,11 @@ def variant_case(variant: str, network: str) -> AlgorithmSettings:
 
 VARIANT_CASES = {f"{variant}/{network}": variant_case(variant, network) for variant in VARIANTS for network in NETWORKS}
 MORE_CASES = {
-    "three snapshots, three updates apart": dataclasses.replace(
-        VARIANT_CASES["averaged/mlp"], snapshots=3, snapshot_interval=3
+    "three snapshots, three updates apart, mean for the actor": dataclasses.replace(
+        VARIANT_CASES["averaged/mlp"], snapshots=3, snapshot_interval=3, actor_reduction="mean"
     ),
     "three critics, mean in the target": dataclasses.replace(
         VARIANT_CASES["averaged/mlp"], snapshots=2, critics=3, target_reduction="mean"
-    ),
-    "three critics, mean for the actor": dataclasses.replace(
-        VARIANT_CASES["sac/mlp"], critics=3, actor_reduction="mean"
     ),
     "gradient on α, given target entropy, clipped log-std": dataclasses.replace(
         VARIANT_CASES["sac-auto/mlp"],

@@ -75,11 +75,7 @@ def test_a_one_step_episode_is_worth_its_reward_without_any_entropy():
     assert trained.q(1.0) == pytest.approx([2.0, 2.0], abs=0.05)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"snapshots": 3, "snapshot_interval": 5}, {"entropy_window": 10}],
-    ids=["sac", "averaged", "averaged-entropy"],
-)
+@pytest.mark.parametrize("changes", [{}, {"snapshots": 3, "snapshot_interval": 5}], ids=["sac", "averaged"])
 def test_an_episode_that_only_time_ends_is_worth_all_its_future_rewards_and_entropies(changes):
     batches = stream(reward=2.0, state=1.0, next_state=1.0, terminated=0, action=uniform_actions())
     trained = Trained(batches, **changes)

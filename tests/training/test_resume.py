@@ -24,7 +24,7 @@ SMALL = {
     "random_steps": 200,
     "update_interval": 5,
     "replay_capacity": 300,  # it wraps around before and after the stop
-    "evaluation_episodes": 2,
+    "evaluation_episodes": 1,
     "evaluation_interval_steps": 330,  # in the middle of an episode
     "log_interval": 7,  # windows are open at the stop
     "max_steps": 660,
@@ -132,14 +132,6 @@ def test_the_straight_run_has_something_to_compare(straight_runs):
     assert len(found["metrics.jsonl"]) == 92 // 7 + 1
     assert [int(row["episode"]) for row in found["episodes.csv"]] == [0, 1, 2]
     assert [int(row["steps"]) for row in found["evaluations.csv"]] == [330, 660]
-
-
-def test_another_seed_gives_another_run(straight_runs, tmp_path):
-    config, folder = straight_runs("Pendulum-v1")
-    other = straight(type(config).from_dict({**config.to_dict(), "seed": 4}), tmp_path / "other")
-    first, second = fingerprint(folder), fingerprint(other)
-    for name in ("learner.safetensors", "replay-0000.safetensors", "episodes.csv", "evaluations.csv"):
-        assert first[name] != second[name], name
 
 
 def test_another_process_with_the_same_seed_gives_the_same_run(straight_runs, tmp_path):

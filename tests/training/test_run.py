@@ -93,10 +93,11 @@ def test_no_protocol_updates_before_a_batch_can_be_drawn(protocol):
     assert config.training.updates_due(config.algorithm.batch_size) == 0
 
 
-@pytest.mark.parametrize("count", [1, 3, 5])
-def test_parallel_environments_keep_the_ratio_of_updates_to_steps(count):
+@pytest.mark.parametrize("count", [1, 3])
+def test_parallel_environments_keep_the_ratio_of_updates_to_steps(count, shared_run):
     run = Run(tiny_config(parallel_environments=count))
-    for number in range(1, 12):
+    assert run.update is shared_run.update  # the same settings are compiled once for all runs
+    for number in range(1, 22):
         run.step()
         assert run.counters.steps == run.replay.added == number * count
         assert run.counters.updates == max(0, number * count - 12) // 2 == int(run.learner_state.step)
@@ -104,7 +105,7 @@ def test_parallel_environments_keep_the_ratio_of_updates_to_steps(count):
     run.close()
 
 
-def test_actions_are_uniform_during_the_random_steps_and_then_the_policys():
+def test_actions_are_uniform_during_the_random_steps_and_then_the_policys_and_all_is_stored_as_it_was():
     run = Run(tiny_config(max_updates=1))
     stream = seeds.generator(run.config.seed, "exploration")
     expected = [stream.uniform(-1, 1, (1, 1)).astype(np.float32) for _ in range(12)]
@@ -114,22 +115,26 @@ def test_actions_are_uniform_during_the_random_steps_and_then_the_policys():
         noise = stream.standard_normal((1, 1), np.float32)
         expected.append(run.policy.act(np.asarray(run.learner_state.actor), run.environments.observation, noise))
         run.step()
-    stored = run.replay.layout.unpack(run.replay.rows[:20]).action
-    np.testing.assert_array_equal(stored, np.concatenate(expected))
-    run.close()
-
-
-def test_the_replay_buffer_holds_what_the_environment_gave():
-    run = Run(tiny_config())
-    for _ in range(12):
-        run.step()
-    batch = run.replay.layout.unpack(run.replay.rows[:12])
+    stored = run.replay.layout.unpack(run.replay.rows[:20])
+    np.testing.assert_array_equal(stored.action, np.concatenate(expected))
     limit = tiny.TIME_LIMIT
-    assert batch.observation[:, 1].tolist() == [n % limit for n in range(12)]
-    assert batch.next_observation[:, 1].tolist() == [n % limit + 1 for n in range(12)]
-    assert batch.reward.tolist() == [n % limit + 1 for n in range(12)]
-    assert batch.terminated.tolist() == [0] * 12
+    assert stored.observation[:, 1].tolist() == [n % limit for n in range(20)]
+    assert stored.next_observation[:, 1].tolist() == [n % limit + 1 for n in range(20)]
+    assert stored.reward.tolist() == [n % limit + 1 for n in range(20)]
+    assert stored.terminated.tolist() == [0] * 20
     run.close()
+
+
+def test_another_seed_draws_everything_anew(shared_run):
+    other = Run(dataclasses.replace(tiny_config(), seed=1))
+    for name in ("actor", "critic", "key"):
+        first, second = (np.asarray(getattr(some.learner_state, name)) for some in (shared_run, other))
+        assert not np.array_equal(first, second), name
+    assert not np.array_equal(shared_run.environments.observation, other.environments.observation)
+    for name in ("exploration", "sampling"):
+        first, second = (getattr(some, name).bit_generator.state for some in (shared_run, other))
+        assert first != second, name
+    other.close()
 
 
 def test_evaluations_leave_training_untouched():
@@ -239,9 +244,3 @@ def test_an_update_that_is_not_finite_is_named_with_its_metrics(run):
     assert run.window_array().shape == (2, len(Metrics._fields))
     run.window = []
     assert run.window_array().shape == (0, len(Metrics._fields))
-
-
-def test_the_same_settings_are_compiled_once_for_all_runs(run):
-    other = Run(tiny_config(parallel_environments=2))
-    assert other.update is run.update
-    other.close()

@@ -11,7 +11,7 @@ import numpy as np
 
 from saclab.algorithm.types import Metrics
 from saclab.protocols import make_config
-from saclab.training.run_folder import EPISODE_COLUMNS, FORMAT, evaluation_columns, run_path
+from saclab.training.run_folder import EPISODE_COLUMNS, FORMAT, Q_BIAS_COLUMNS, evaluation_columns, run_path
 
 VERSIONS = {"saclab": "0.1.0", "jax": "0.10.2", "gymnasium": "1.4.0", "mujoco": "4.0.0", "python": "3.11.9"}
 TEST_EPISODES = 20
@@ -33,6 +33,7 @@ def write_run(
     rename: dict[str, Any] | None = None,
     name: str | None = None,
     returns: list[float] | None = None,
+    q_bias: bool = False,
 ) -> Path:
     """Write one run and return its folder; `returns` are the test returns, else a noisy rise to about `level`."""
     config = make_config(environment, variant, protocol, seed, overrides=overrides)
@@ -52,6 +53,7 @@ def write_run(
     write_evaluations(folder, generator, curve, count, returns)
     write_episodes(folder, curve, 10 * count)
     write_metrics(folder, generator, curve, 10 * count, metrics)
+    write_q_bias(folder, count if q_bias else 0)
     if finished:
         (folder / "result.json").write_text(json.dumps({"reason": "max_updates"}))
     return folder
@@ -77,6 +79,17 @@ def write_episodes(folder: Path, curve: np.ndarray, count: int) -> None:
         for episode in range(1, count + 1):
             average = 0.8 * average + 0.2 * curve[episode]
             writer.writerow([episode, 1000 * episode, 200 * episode, curve[episode], average, 1000, 0, 2.0 * episode])
+
+
+def write_q_bias(folder: Path, count: int) -> None:
+    with (folder / "q_bias.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, Q_BIAS_COLUMNS, restval=1.0)
+        writer.writeheader()
+        for index in range(1, count + 1):
+            writer.writerow({
+                "evaluation": index, "steps": 10_000 * index, "updates": 2000 * index, "episodes": 10 * index,
+                "mean_bias": 0.5 / index, "seconds": 20.0 * index,
+            })  # fmt: skip
 
 
 def write_metrics(folder: Path, generator: Any, curve: np.ndarray, count: int, names: tuple[str, ...]) -> None:

@@ -67,7 +67,7 @@ def report(tmp_path_factory):
     root = tmp_path_factory.mktemp("report")
     runs = [
         write_run(root, variant, seed, environment, overrides={"max_updates": 60_000}, level=5000 + 1500 * index,
-                  finished=(variant, seed) != ("averaged", 1))
+                  finished=(variant, seed) != ("averaged", 1), q_bias=environment == "Humanoid-v4")
         for environment in ("HalfCheetah-v4", "Humanoid-v4")
         for index, variant in enumerate(("sac", "averaged", "averaged-auto")) for seed in (0, 1)
     ]  # fmt: skip
@@ -126,8 +126,10 @@ def test_script_data_covers_every_run_and_panel(report):
     _, page = report
     data = page.data
     assert [environment["name"] for environment in data["environments"]] == ["HalfCheetah-v4", "Humanoid-v4"]
+    assert [len(environment["panels"]) for environment in data["environments"]] == [9, 11]
+    assert [panel["title"] for panel in data["environments"][1]["panels"][-2:]] == ["Q bias", "Q bias, spread"]
+    assert data["environments"][1]["panels"][-2]["arms"][0]["middle"][:2] == [0.5, 0.25]
     for environment in data["environments"]:
-        assert len(environment["panels"]) == 9
         for panel in environment["panels"]:
             assert [len(arm["runs"]) for arm in panel["arms"]] == [2, 2, 2]
             for arm in panel["arms"]:

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from saclab.comparison.curves import AXES, DIAGNOSTICS, PAPER_PANELS, ArmCurves, Curves, Quantity, logged
-from saclab.comparison.runs import Arm, Comparison, all_notices, notices, shown
+from saclab.comparison.runs import Arm, Comparison, all_notices, by_paper_name, notices, shown
 from saclab.comparison.scores import AggregateScores, EnvironmentScores, Pair, number_text
 from saclab.comparison.statistics import Band, Interval
 from saclab.paper import paper_curves
@@ -84,8 +84,7 @@ def save(figure: Figure | None, path: Path, said: Sequence[str]) -> list[Path]:
     if figure is None:
         return []
     if said:
-        text = "\n".join(textwrap.wrap(" · ".join(said), 110))
-        figure.supxlabel(text, fontsize=8, color="#8a3b00", fontweight="bold")
+        figure.supxlabel(wrapped(" · ".join(said), 110), fontsize=8, color="#8a3b00", fontweight="bold")
     FigureCanvasAgg(figure)
     for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
         figure.savefig(path.with_name(f"{path.name}.{suffix}"), dpi=DOTS_PER_INCH, metadata=metadata)
@@ -127,7 +126,7 @@ def draw_curves(
             if of_arm := curves.get((environment, arm, quantity.key)):
                 handles |= draw_arm(panel, of_arm, arm, quantity.axis, index)
         if quantity.key == "test_reward":
-            handles |= draw_paper(panel, environment, {arm.paper_name: index for arm, index in styles.items()})
+            handles |= draw_paper(panel, environment, by_paper_name(styles))
         panel.set_title(quantity.title, loc="left", fontsize=10)
         panel.set_xlabel(AXES[quantity.axis])
         panel.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -150,10 +149,10 @@ def draw_arm(panel: Any, curves: ArmCurves, arm: Arm, axis: str, index: int) -> 
             panel.plot(curve.x[axis], curve.y, color=colour, linewidth=0.5, alpha=0.45)
         panel.fill_between(band.x[axis], band.low, band.high, color=colour, alpha=0.18, linewidth=0)
     (line,) = panel.plot(band.x[axis], band.middle, **marker_style(index, len(band.middle)))
-    return {f"{arm.title}, {seeds_text(band.runs)}": line}
+    return {wrapped(f"{arm.title}, {seeds_text(band.runs)}", 40): line}
 
 
-def draw_paper(panel: Any, environment: str, styles: dict[str | None, int]) -> dict[str, Any]:
+def draw_paper(panel: Any, environment: str, styles: dict[str, int]) -> dict[str, Any]:
     """The paper's own test-reward curves, dashed, in the colour of the variant of that name."""
     handles = {}
     limit = panel.get_xlim()[1] if panel.lines else np.inf
@@ -163,6 +162,10 @@ def draw_paper(panel: Any, environment: str, styles: dict[str | None, int]) -> d
         (line,) = panel.plot(x, y, color=colour, linewidth=1.1, linestyle="--")
         handles[f"paper: {name}, 1 seed, ±300"] = line
     return handles
+
+
+def wrapped(text: str, width: int = 32) -> str:
+    return "\n".join(textwrap.wrap(text, width, break_on_hyphens=False))
 
 
 def seeds_text(count: int) -> str:
@@ -198,10 +201,9 @@ def draw_scores(entry: EnvironmentScores, styles: dict[Arm, int]) -> Figure | No
                 panel.plot([arm.paper_best], [row], linestyle="none", marker="D", color="none", markeredgecolor="black")
         panel.set_title(title, loc="left", fontsize=10)
         panel.margins(x=0.12)
-    set_arm_rows(panels[0], [f"{arm.arm.title}\n{seeds_text(len(arm.runs))}" for arm in arms])
-    panels[0].set_xlabel("point: interquartile mean · bar: 95 % interval · ticks: runs", fontsize=8)
-    if any(arm.paper_best is not None for arm in arms):
-        panels[1].set_xlabel("◇ the paper's Table 2, 1 seed", fontsize=8)
+    set_arm_rows(panels[0], [f"{wrapped(arm.arm.title)}\n{seeds_text(len(arm.runs))}" for arm in arms])
+    paper = " · ◇: the paper's Table 2, 1 seed" if any(arm.paper_best is not None for arm in arms) else ""
+    panels[1].set_xlabel(f"point: interquartile mean · bar: 95 % interval · tick: single run{paper}", fontsize=8)
     return figure
 
 
@@ -240,11 +242,11 @@ def draw_pairs(pairs: Sequence[Pair], title: str) -> Figure | None:
                 fontweight="bold" if pair.improvement.decided else "normal",
             )
     panel.imshow(matrix, cmap=matplotlib.colormaps["PuOr"], vmin=-0.3, vmax=1.3)
-    names = ["\n".join(textwrap.wrap(arm.title, 16)) for arm in arms]
+    names = [wrapped(arm.title, 19) for arm in arms]
     panel.set_xticks(range(len(arms)), names)
     panel.set_yticks(range(len(arms)), names)
     panel.grid(False)
-    figure.suptitle("\n".join(textwrap.wrap(figure.get_suptitle(), int(10 * size))), fontsize=10, fontweight="bold")
+    figure.suptitle(wrapped(figure.get_suptitle(), int(10 * size)), fontsize=10, fontweight="bold")
     return figure
 
 
@@ -260,7 +262,7 @@ def draw_profiles(
         colour = COLOURS[styles[arm] % len(COLOURS)]
         panel.fill_between(thresholds, profile.low, profile.high, color=colour, alpha=0.15, linewidth=0, step="mid")
         panel.plot(thresholds, profile.middle, drawstyle="steps-mid", **marker_style(styles[arm], len(thresholds)),
-                   label=f"{arm.title}, {seeds_text(profile.runs)}")  # fmt: skip
+                   label=wrapped(f"{arm.title}, {seeds_text(profile.runs)}"))  # fmt: skip
     panel.set_xlabel(axis)
     panel.set_ylabel("share of runs that score above")
     panel.set_ylim(-0.03, 1.03)
@@ -277,7 +279,9 @@ def draw_aggregate(aggregate: AggregateScores | None, styles: dict[Arm, int]) ->
     panel = figure.subplots()
     for row, entry in enumerate(aggregate.arms):
         draw_interval(panel, row, entry.interquartile_mean, styles[entry.arm])
-    set_arm_rows(panel, [f"{entry.arm.title}\n{entry.interquartile_mean.runs} runs" for entry in aggregate.arms])
+    set_arm_rows(
+        panel, [f"{wrapped(entry.arm.title)}\n{entry.interquartile_mean.runs} runs" for entry in aggregate.arms]
+    )
     panel.set_xlabel("interquartile mean of normalised final test returns")
     profiles = {entry.arm: entry.profile for entry in aggregate.arms}
     return {

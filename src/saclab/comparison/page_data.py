@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from saclab.comparison.curves import AXES, DIAGNOSTICS, PAPER_PANELS, Curves, Quantity, logged
-from saclab.comparison.runs import Arm, Comparison, shown
+from saclab.comparison.runs import Arm, Comparison, by_paper_name, shown
 from saclab.comparison.scores import AggregateScores, EnvironmentScores
 from saclab.comparison.statistics import Band, Interval
 from saclab.paper import STEPS_PER_EPISODE, UPDATES_PER_EPISODE, paper_curves
@@ -119,7 +119,7 @@ def panel_data(
 
 def paper_data(environment: str, places: dict[Arm, int], pool: AxisPool) -> list[dict[str, Any]]:
     """The paper's curves. Only HalfCheetah's episodes all have one length, so only there steps are known as well."""
-    by_name = {arm.paper_name: place for arm, place in places.items()}
+    by_name = by_paper_name(places)
     lines = []
     for name, curve in paper_curves(environment).items():
         x = {"episodes": curve.episode}

@@ -78,6 +78,11 @@ class Comparison(NamedTuple):
         return tuple(run for environment in self.environments for run in self.runs_of(environment))
 
 
+def by_paper_name(places: Mapping[Arm, int]) -> dict[str, int]:
+    """The paper's systems -> place of the first arm that is the same system."""
+    return {arm.paper_name: place for arm, place in reversed(list(places.items())) if arm.paper_name is not None}
+
+
 def shown(text: object, limit: int = 80) -> str:
     """Text from a run folder as one short printable line: no control characters, nothing that cannot be encoded."""
     printable = "".join(character if character.isprintable() else " " for character in str(text))

@@ -1,6 +1,6 @@
 """Checkpoints: written whole or not at all, checksummed, never unpickled, and cheap to take often.
 
-    checkpoints/step-000000012000/
+    checkpoints/step-000000012000/                       or step-…-untested, if a test of the policy comes first
       learner.safetensors, environments.safetensors, …   one file per group of arrays
       replay-0000.safetensors, …                         the replay buffer, SEGMENT_ROWS rows each
       manifest.json                                      every file's SHA-256 and size, and the plain state
@@ -36,7 +36,7 @@ KEPT = 2
 SEGMENT_ROWS = 8192
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
 SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
-CHECKPOINT_NAME = re.compile(r"step-\d{12,}")
+CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(-untested)?")
 MANIFEST_BYTES = 2**26  # far more than the plain state of a thousand environments
 LARGEST_COUNT = 2**53
 
@@ -54,13 +54,18 @@ class Checkpoint(NamedTuple):
     """JSON-able."""
 
 
-def save_checkpoint(folder: Path, step: int, checkpoint: Checkpoint, replay: ReplayBuffer) -> Path:
-    """Write `folder`/step-… and remove all but the newest two; an existing one of the same step stays.
+def save_checkpoint(
+    folder: Path, step: int, checkpoint: Checkpoint, replay: ReplayBuffer, untested: bool = False
+) -> Path:
+    """Write `folder`/step-… and remove all but the newest two; an existing one of the same name stays.
+
+    An `untested` one is of the moment before the test of the policy that falls into this step, and older than one
+    of the moment after it.
 
     Raises:
         CheckpointError: if it cannot be written; what was there before is whole.
     """
-    final = folder / f"step-{step:012d}"
+    final = folder / f"step-{step:012d}{'-untested' if untested else ''}"
     if final.exists():
         return final
     partial = final.with_suffix(".partial")
@@ -122,8 +127,9 @@ def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[s
 
 def newest_first(folder: Path) -> list[Path]:
     """The finished checkpoints."""
-    found = [path for path in folder.glob("step-*") if CHECKPOINT_NAME.fullmatch(path.name)]
-    return sorted(found, key=lambda path: int(path.name.removeprefix("step-")), reverse=True)
+    found = [(match, path) for path in folder.glob("step-*") if (match := CHECKPOINT_NAME.fullmatch(path.name))]
+    found.sort(key=lambda pair: (int(pair[0][1]), pair[0][2] is None), reverse=True)
+    return [path for _, path in found]
 
 
 def replaced_by_next(folder: Path) -> Path | None:

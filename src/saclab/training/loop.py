@@ -112,9 +112,10 @@ class Session:
                     yield self._evaluate()
                 except Stopped:
                     run.counters.evaluation_slots = EVALUATE_FIRST
+                    yield from self._stop(untested=True)
+                    return
             if self.requests.stop:
-                yield self._save()
-                yield Interrupted(run.counters.steps)
+                yield from self._stop()
                 return
             now = time.monotonic()
             if self.requests.save or now - self.last_save > self.checkpoint_seconds:
@@ -206,14 +207,20 @@ class Session:
             facts = {"mean_return": run.counters.best_return, "episode": run.counters.best_at_episode}
             save_policy(self.folder / "best", run.config, run.spec, run.best_actor, facts)
 
-    def _save(self) -> Saved:
+    def _stop(self, untested: bool = False) -> Iterator[Event]:
+        yield self._save(untested)
+        yield Interrupted(self.run.counters.steps)
+
+    def _save(self, untested: bool = False) -> Saved:
         self.requests.save = False
         began = time.monotonic()
         self.run.counters.seconds = self._seconds()
         checkpoint = self.run.capture()
         checkpoint.state["logs"] = self.logs.positions()
         checkpoint.state["facts"] = machine_facts()
-        path = save_checkpoint(self.folder / "checkpoints", self.run.counters.steps, checkpoint, self.run.replay)
+        path = save_checkpoint(
+            self.folder / "checkpoints", self.run.counters.steps, checkpoint, self.run.replay, untested
+        )
         self.last_save = time.monotonic()
         return Saved(path, self.last_save - began)
 
@@ -258,8 +265,7 @@ class Session:
             try:
                 yield self._evaluate()
             except Stopped:
-                yield self._save()
-                yield Interrupted(counters.steps)
+                yield from self._stop(untested=True)
                 return
         counters.seconds = self._seconds()
         yield self._save()

@@ -31,7 +31,6 @@ from saclab.training.checkpoint import Arrays, Checkpoint, CheckpointError
 from saclab.training.evaluation import EvaluationEpisodes, Evaluator
 from saclab.training.q_bias import Critics, QBias, measure_q_bias
 
-
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
 
 
@@ -82,7 +81,7 @@ class Run:
 
         learner = make_learner(algorithm, self.spec.observation_size, self.spec.action_size)
         self.policy, self.q_network = learner.policy, learner.q_network
-        self.learner_state: LearnerState = jax.jit(learner.init)(seeds.learner_key(config.seed))
+        self.learner_state: LearnerState = compiled_init(algorithm, layout)(seeds.learner_key(config.seed))
         self.update = compiled_update(algorithm, layout)
         self.exploration = seeds.generator(config.seed, "exploration")
         self.sampling = seeds.generator(config.seed, "replay")
@@ -302,6 +301,12 @@ class Run:
     def close(self) -> None:
         self.environments.close()
         self.evaluator.close()
+
+
+@lru_cache(maxsize=16)
+def compiled_init(settings: AlgorithmSettings, layout: RowLayout) -> Callable[[np.ndarray], LearnerState]:
+    """key u32[2] -> the state before the first update, compiled once."""
+    return jax.jit(make_learner(settings, layout.observation_size, layout.action_size).init)
 
 
 @lru_cache(maxsize=16)

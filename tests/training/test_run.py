@@ -87,6 +87,13 @@ def test_the_papers_protocol_makes_200_updates_per_episode_of_1000_steps():
     assert (humanoid.max_updates, humanoid.max_episodes, humanoid.patience_episodes) == (1_500_000, 10_000, 750)
 
 
+@pytest.mark.parametrize("name", ["Humanoid-v4", "Humanoid-v5", "gymnasium.envs.mujoco:Humanoid-v4"])
+def test_the_papers_settings_for_humanoid_hold_however_its_id_is_written(name):
+    config = make_config(name, "sac", "paper")
+    assert (config.algorithm.initial_temperature, config.training.max_updates) == (0.1, 1_500_000)
+    assert config.training.patience_episodes == 750
+
+
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_no_protocol_updates_before_a_batch_can_be_drawn(protocol):
     config = make_config("HalfCheetah-v4", protocol=protocol)

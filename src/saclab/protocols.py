@@ -8,7 +8,7 @@ from typing import Any
 
 from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names, replace_settings
 from saclab.errors import unknown_name
-from saclab.variants import variant_settings
+from saclab.variants import task_name, variant_settings
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def training_settings(protocol: str, environment: str) -> TrainingSettings:
         raise unknown_name("protocol", protocol, PROTOCOLS)
     settings = PROTOCOLS[protocol].settings
     for prefix, changes in PROTOCOLS[protocol].by_environment.items():
-        if environment.startswith(prefix):
+        if task_name(environment).startswith(prefix):
             settings = replace_settings(settings, changes)
     return settings
 

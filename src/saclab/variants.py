@@ -58,9 +58,14 @@ VARIANTS: dict[str, Variant] = {
 }
 
 
+def task_name(environment: str) -> str:
+    """A Gymnasium id without package and namespace: Humanoid-v4 of package.module:name/Humanoid-v4."""
+    return environment.rpartition(":")[2].rpartition("/")[2]
+
+
 def fixed_temperature(environment: str) -> float:
     """The paper's fixed α (Table 1): 0.1 on Humanoid; 0.2 on HalfCheetah and, here, everywhere else."""
-    return 0.1 if environment.startswith("Humanoid-") else 0.2
+    return 0.1 if task_name(environment).startswith("Humanoid-") else 0.2
 
 
 def variant_settings(variant: str, environment: str) -> AlgorithmSettings:

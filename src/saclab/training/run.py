@@ -305,7 +305,7 @@ class Run:
 
 @lru_cache(maxsize=16)
 def compiled_init(settings: AlgorithmSettings, layout: RowLayout) -> Callable[[np.ndarray], LearnerState]:
-    """key u32[2] -> the state before the first update, compiled once."""
+    """Key u32[2] -> the state before the first update, compiled once."""
     return jax.jit(make_learner(settings, layout.observation_size, layout.action_size).init)
 
 

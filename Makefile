@@ -9,10 +9,10 @@ quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in mi
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
 
 test: $(VENV)/installed  ## the fast tests
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(VENV)/installed  ## learning to a threshold, long kill-and-resume
-	$(BIN)/python -m pytest -n auto -m slow
+	$(BIN)/python -m pytest -n auto --dist loadfile -m slow
 
 check: lint types test
 

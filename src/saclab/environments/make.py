@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -12,6 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 
 from saclab.errors import SettingError, UserError, unknown_name
+from saclab.variants import task_name
 
 
 class EnvironmentSpec(NamedTuple):
@@ -44,30 +46,44 @@ def make_environment(
     if render_mode is not None:
         arguments["render_mode"] = render_mode
     quiet_simulator()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), making(environment, arguments):
         warnings.simplefilter("ignore")  # v4 environments are here on purpose: no deprecation notices
-        try:
-            made = gymnasium.make(environment, disable_env_checker=True, **arguments)
-        except ModuleNotFoundError as error:
-            raise UserError(
-                f"environment = {environment!r}: {error}; install the package, or import its environments with an id "
-                "of the form package.module:Name-v0"
-            ) from error
-        except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound,
-                gymnasium.error.DeprecatedEnv, gymnasium.error.UnregisteredEnv) as error:  # fmt: skip
-            raise unknown_environment(environment) from error
-        except gymnasium.error.Error as error:
-            raise UserError(f"environment = {environment!r}: {error}") from error
-        except TypeError as error:
-            raise SettingError(
-                "environment_arguments", arguments, f"{environment} does not accept them ({error})"
-            ) from error
+        made = gymnasium.make(environment, disable_env_checker=True, **arguments)
     try:
+        require_version(environment, made)
         environment_spec(environment, made)
     except UserError:
         made.close()
         raise
     return made
+
+
+@contextmanager
+def making(environment: str, arguments: Mapping[str, Any]) -> Iterator[None]:
+    """Turn what goes wrong while an environment is made into a UserError that says what would work."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"environment = {environment!r}: {error}; install the package, or import its environments with an id "
+            "of the form package.module:Name-v0"
+        ) from error
+    except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound,
+            gymnasium.error.DeprecatedEnv, gymnasium.error.UnregisteredEnv) as error:  # fmt: skip
+        raise unknown_environment(environment) from error
+    except (TypeError, OSError) as error:
+        raise SettingError(
+            "environment_arguments", dict(arguments), f"{environment} does not accept them ({error})"
+        ) from error
+    except (gymnasium.error.Error, ImportError) as error:
+        raise UserError(f"environment = {environment!r}: {error}") from error
+
+
+def require_version(name: str, environment: gymnasium.Env[Any, Any]) -> None:
+    """Refuse an id without a version: what it stands for changes with Gymnasium, and a run must say what it ran."""
+    full = environment.spec.id if environment.spec is not None else name
+    if task_name(name) != task_name(full):
+        raise SettingError("environment", name, f"give its version too, such as {full}")
 
 
 def environment_spec(name: str, environment: gymnasium.Env[Any, Any]) -> EnvironmentSpec:

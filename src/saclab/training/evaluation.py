@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from saclab.environments.make import environment_spec, make_environment
+from saclab.errors import NonFiniteError
 
 
 class EvaluationEpisodes(NamedTuple):
@@ -26,7 +27,11 @@ class Evaluator:
         self.spec = environment_spec(environment, self.environments[0])
 
     def run(self, act: Callable[[np.ndarray], np.ndarray], seeds: Sequence[int]) -> EvaluationEpisodes:
-        """One episode per seed; `act` takes observations f32[n, O] and gives actions f32[n, A] in [-1, 1]."""
+        """One episode per seed; `act` takes observations f32[n, O] and gives actions f32[n, A] in [-1, 1].
+
+        Raises:
+            NonFiniteError: if an environment gives an observation or a reward that is not finite.
+        """
         while len(self.environments) < len(seeds):
             self.environments.append(make_environment(self.name, self.arguments))
         observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
@@ -44,7 +49,17 @@ class Evaluator:
                 if not (terminated or truncated):
                     going_on.append(index)
             active = going_on
+            self._require_finite(observation, total_rewards)
         return EvaluationEpisodes(total_rewards, lengths)
+
+    def _require_finite(self, observation: np.ndarray, total_rewards: np.ndarray) -> None:
+        finite = np.isfinite(observation).all(axis=1) & np.isfinite(total_rewards)
+        if not finite.all():
+            episodes = np.flatnonzero(~finite).tolist()
+            raise NonFiniteError(
+                f"test episodes {episodes} of {self.name} gave an observation or a reward that is not finite: check "
+                "the environment, or wrap it so that it ends the episode before it diverges"
+            )
 
     def close(self) -> None:
         for environment in self.environments:

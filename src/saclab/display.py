@@ -106,6 +106,9 @@ def show_grid(stream: Iterable[Sequence[RunStatus]], console: Console) -> list[R
                 last_line = time.monotonic()
                 console.print(grid_line(statuses), soft_wrap=True)
     console.print(grid_table(statuses, rows=len(statuses)))
+    for status in statuses:
+        for warning in status.warnings:
+            console.print(f"warning: {run_name(status)}: {warning}", markup=False, soft_wrap=True)
     return list(statuses)
 
 

@@ -109,7 +109,7 @@ def load_policy(run: Path | str) -> TrainedPolicy:
         raise UserError(f"{run} holds no policy yet: the first is kept after the run's first evaluation")
     description = read_description(folder)
     try:
-        arrays = safetensors.numpy.load_file(folder / ARRAYS)
+        arrays = safetensors.numpy.load((folder / ARRAYS).read_bytes())
         algorithm = description["algorithm"]
         settings = AlgorithmSettings(**{**algorithm, "hidden_layers": tuple(algorithm["hidden_layers"])})
         sizes = int(description["observation_size"]), int(description["action_size"])
@@ -117,7 +117,7 @@ def load_policy(run: Path | str) -> TrainedPolicy:
             settings, EnvironmentSpec(*sizes, arrays["action_low"], arrays["action_high"]), arrays["actor"]
         )
         require_arrays(policy)
-    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+    except (safetensors.SafetensorError, OSError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"the policy in {folder} is damaged ({error}): train again, or resume the run if it is unfinished"
         ) from error

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import IO, Literal
 
@@ -35,6 +36,8 @@ class RunStatus:
     test_return: float | None = None
     message: str = ""
     """Why it failed."""
+    warnings: list[str] = field(default_factory=list)
+    """What the run said of itself that the user should know."""
     first_progress: tuple[float, float, int] | None = field(default=None, repr=False)
     """Clock, fraction and updates when this session's first update had been made: compilation is not in the rate."""
 
@@ -46,6 +49,8 @@ class RunStatus:
                 self._measure_rate(time.monotonic())
             case {"event": "evaluated", "mean_return": float(mean)}:
                 self.test_return = mean
+            case {"event": "warned", "message": str(text)}:
+                self.warnings.append(text)
             case {"event": "finished"}:
                 self.status, self.fraction = "finished", 1.0
             case {"event": "interrupted"}:
@@ -92,7 +97,7 @@ def launch(
                     if not worker.read():
                         selector.unregister(worker.output)
                         del running[key.fd]
-                        worker.ended()
+                        worker.ended(stopping)
                 yield statuses
         finally:
             for worker in running.values():
@@ -127,8 +132,9 @@ class Worker:
             "folder": str(folder),
             "checkpoint_minutes": checkpoint_minutes,
         }
-        self.process.stdin.write(json.dumps(task).encode())
-        self.process.stdin.close()
+        with suppress(BrokenPipeError):  # it is dead already: `ended` will say how
+            self.process.stdin.write(json.dumps(task).encode())
+            self.process.stdin.close()
         self.output: IO[bytes] = self.process.stdout
         self.unread = b""
 
@@ -140,8 +146,11 @@ class Worker:
             self.status.enter(json.loads(line))
         return bool(content)
 
-    def ended(self) -> None:
-        """Note how the process ended; a worker that said nothing of its end has failed."""
+    def ended(self, stopping: bool) -> None:
+        """Note how the process ended; a worker that said nothing of its end has failed.
+
+        One that was told to stop before it could listen, while it was still importing, has lost nothing.
+        """
         code = self.process.wait()
         self.output.close()
         self.log.seek(0)
@@ -150,6 +159,9 @@ class Worker:
         if self.status.status == "running":
             if code == 0:
                 self.status.status, self.status.fraction = "finished", 1.0
+                return
+            if stopping and code == -signal.SIGTERM:
+                self.status.status = "interrupted"
                 return
             self.status.status = "failed"
             how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"

@@ -14,7 +14,7 @@ def main() -> int:
     """Train the run; exit status 0 if it finished or was stopped on request, 2 for a user's error, 1 for any other."""
     task = json.load(sys.stdin)
     from saclab.signals import requests_from_signals
-    from saclab.training.events import Evaluated, Finished, Interrupted, Progress
+    from saclab.training.events import Evaluated, Finished, Interrupted, Progress, Started, Warned
     from saclab.training.loop import train
     from saclab.training.requests import Requests
 
@@ -29,6 +29,11 @@ def main() -> int:
             config = Config.from_dict(task["config"])
             for event in train(config, Path(task["folder"]), requests, task["checkpoint_minutes"]):
                 match event:
+                    case Started(notes=(_ratio, *notes)):
+                        for note in notes:
+                            tell(requests, event="warned", message=note)
+                    case Warned(message=message):
+                        tell(requests, event="warned", message=message)
                     case Progress():
                         tell(requests, event="progress", **event._asdict())
                     case Evaluated():

@@ -293,7 +293,7 @@ def read_arrays(folder: Path, name: str, entry: dict[str, Any]) -> Arrays:
         raise CheckpointError(f"{name} does not match its checksum")
     try:
         arrays: Arrays = safetensors.numpy.load(content)
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (safetensors.SafetensorError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{name} is not a safetensors file: {error}") from error
     return arrays
 

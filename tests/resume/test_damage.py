@@ -1,0 +1,362 @@
+"""What has been damaged or was made to harm is named, and never run."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import pickle
+import random
+import shutil
+import struct
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from saclab.errors import TrainingFailed, UserError
+from saclab.training import checkpoint, loop
+from saclab.training.checkpoint import CheckpointError, newest_first
+from saclab.training.events import Finished, Started
+from saclab.training.run import Run
+
+from .helpers import assert_same_run, finish, small_config, stop_at
+
+FIRST, SECOND = 100, 130
+FILES = ("manifest.json", "manifest.sha256", "learner.safetensors", "environments.safetensors", "window.safetensors",
+         "best.safetensors", "replay-0000.safetensors", "replay-0003.safetensors")  # fmt: skip
+
+
+class Stage:
+    """A run with checkpoints at FIRST and SECOND, copied for each test; one `Run` in memory serves them all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.config = small_config("Pendulum-v1", environments=2, max_steps=150)
+        self.saved, self.straight = folder / "saved", folder / "straight"
+        finish(self.config, self.straight)
+        stop_at(FIRST, self.config, self.saved)
+        stop_at(SECOND, self.config, self.saved)
+        self.run = Run(self.config)
+
+    def continue_from(self, folder: Path) -> Started:
+        """What a session tells as it begins; no step is made."""
+        with mock.patch.object(loop, "Run", lambda config: self.run), mock.patch.object(self.run, "close"):
+            events = loop.train(self.config, folder)
+            started = next(events)
+            events.close()
+        assert isinstance(started, Started)
+        return started
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint, "SEGMENT_ROWS", 40)
+        yield Stage(tmp_path_factory.mktemp("stage"))
+
+
+@pytest.fixture
+def folder(stage, tmp_path):
+    return Path(shutil.copytree(stage.saved, tmp_path / "run"))
+
+
+def newest(folder: Path) -> Path:
+    return newest_first(folder / "checkpoints")[0]
+
+
+def older(folder: Path) -> Path:
+    return newest_first(folder / "checkpoints")[1]
+
+
+def sign(path: Path, manifest: object) -> None:
+    """Write a manifest with the checksum that belongs to it."""
+    content = manifest if isinstance(manifest, bytes) else json.dumps(manifest).encode()
+    (path / "manifest.json").write_bytes(content)
+    (path / "manifest.sha256").write_text(hashlib.sha256(content).hexdigest() + "\n")
+
+
+def put(path: Path, name: str, content: bytes) -> None:
+    """Put a file into a checkpoint as if saclab had written it: with its size and checksum."""
+    (path / name).write_bytes(content)
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["files"].setdefault(name, {})
+    manifest["files"][name] |= {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    sign(path, manifest)
+
+
+def change_arrays(path: Path, name: str, **changes: np.ndarray | None) -> None:
+    arrays = safetensors.numpy.load((path / name).read_bytes()) | changes
+    put(path, name, safetensors.numpy.save({key: array for key, array in arrays.items() if array is not None}))
+
+
+# --- damage by chance
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_any_flipped_bit_or_missing_end_is_seen_and_the_checkpoint_before_is_used(stage, folder, name):
+    chance, path = random.Random(name), newest(folder) / name
+    content = path.read_bytes()
+    flips = [(position, 1 << chance.randrange(8)) for position in {0, len(content) - 2, chance.randrange(len(content))}]
+    damaged = [content[:position] + bytes([content[position] ^ bit]) + content[position + 1 :] for position, bit in flips]
+    damaged += [content[:length] for length in (0, 1, len(content) // 2, len(content) - 2)] + [content + b"\0"]
+    for bad in damaged:
+        path.write_bytes(bad)
+        started = stage.continue_from(folder)
+        assert started.resumed_at_step == FIRST
+        assert sum(f"step-{SECOND:012d} is damaged" in note for note in started.notes) == 1
+        aside = path.parent.with_suffix(".damaged")
+        assert (aside / name).read_bytes() == bad, "set aside as it was"
+        aside.rename(path.parent)
+    path.write_bytes(content)
+    assert stage.continue_from(folder).resumed_at_step == SECOND
+
+
+def test_the_run_goes_on_from_the_one_before_to_the_same_end(stage, folder):
+    path = newest(folder) / "replay-0001.safetensors"
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    assert isinstance(finish(stage.config, folder)[-1], Finished)
+    assert_same_run(stage.straight, folder)
+    assert not list((folder / "checkpoints").glob("*.damaged")), "gone when whole ones were written"
+    session = json.loads((folder / "sessions.jsonl").read_text().splitlines()[-1])
+    assert any("is damaged" in note for note in session["notes"])
+
+
+def test_two_damaged_checkpoints_are_an_error_that_names_both_and_touches_nothing(stage, folder):
+    for path in newest_first(folder / "checkpoints"):
+        (path / "learner.safetensors").write_bytes(b"")
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(TrainingFailed, match=rf"step-{SECOND:012d} is damaged.*step-{FIRST:012d} is damaged"):
+        stage.continue_from(folder)
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_the_two_kept_checkpoints_share_no_file(stage, folder):
+    first, second = ({file.stat().st_ino for file in path.iterdir()} for path in newest_first(stage.saved / "checkpoints"))
+    assert first.isdisjoint(second)
+    for file in newest(folder).iterdir():
+        file.write_bytes(b"overwritten in place")
+    assert stage.continue_from(folder).resumed_at_step == FIRST
+
+
+def test_a_missing_log_or_a_shorter_one_is_named(stage, folder):
+    log = folder / "episodes.csv"
+    log.write_bytes(log.read_bytes()[:-1])
+    with pytest.raises(UserError, match=r"episodes\.csv is shorter than the checkpoint remembers"):
+        stage.continue_from(folder)
+
+
+def test_a_session_that_a_crash_cut_short_is_in_nobodys_way(stage, folder):
+    sessions = folder / "sessions.jsonl"
+    sessions.write_bytes(sessions.read_bytes() + b'{"began": "20')
+    from saclab.training.run_folder import read_last_session
+
+    assert read_last_session(folder)["from_step"] == FIRST
+    stage.continue_from(folder)
+    assert read_last_session(folder)["from_step"] == SECOND
+    assert len(sessions.read_text().splitlines()) == 4
+
+
+# --- made to harm
+
+
+class Harm:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return os.system, (f"touch '{self.path}'",)
+
+
+def npz_with_objects(harm: Harm) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, actor=np.array([harm], object))
+    return file.getvalue()
+
+
+HOSTILE = {
+    "pickle": pickle.dumps,
+    "npz with objects": npz_with_objects,
+    "yaml": lambda harm: f"!!python/object/apply:os.system ['touch {harm.path}']\n".encode(),
+    "python": lambda harm: f"import os; os.system('touch {harm.path}')\n".encode(),
+    "header of an exabyte": lambda harm: struct.pack("<Q", 2**60) + b"{}",
+    "header of 90 MB": lambda harm: struct.pack("<Q", 90_000_000) + b'{"a":' + b"[" * 1000,
+    "header that is no JSON": lambda harm: struct.pack("<Q", 8) + b"{{{{{{{{",
+    "array of an exabyte": lambda harm: tensor_file("F32", [2**58], [0, 2**60]),
+    "array that overflows": lambda harm: tensor_file("F32", [2**40, 2**40], [0, 16]),
+    "array outside its file": lambda harm: tensor_file("F32", [4], [1000, 1016]),
+    "array of an unknown type": lambda harm: tensor_file("PICKLE", [4], [0, 16]),
+    "array of a type that NumPy lacks": lambda harm: tensor_file("F8_E4M3", [16], [0, 16]),
+    "nothing": lambda harm: b"",
+}
+
+
+def tensor_file(kind: str, shape: list[int], offsets: list[int]) -> bytes:
+    header = json.dumps({"metrics": {"dtype": kind, "shape": shape, "data_offsets": offsets}}).encode()
+    return struct.pack("<Q", len(header)) + header + bytes(16)
+
+
+@pytest.mark.parametrize("content", HOSTILE)
+@pytest.mark.parametrize("name", ["learner.safetensors", "replay-0000.safetensors"])
+def test_a_file_made_to_harm_is_refused_unread_though_its_checksum_is_right(stage, folder, tmp_path, name, content):
+    harm = tmp_path / "harmed"
+    put(newest(folder), name, HOSTILE[content](Harm(harm)))
+    started = stage.continue_from(folder)
+    assert started.resumed_at_step == FIRST
+    assert any(f"is damaged: {name}" in note for note in started.notes)
+    assert not harm.exists()
+
+
+@pytest.mark.parametrize("content", HOSTILE)
+def test_a_manifest_made_to_harm_is_refused(stage, folder, tmp_path, content):
+    harm = tmp_path / "harmed"
+    sign(newest(folder), HOSTILE[content](Harm(harm)))
+    assert stage.continue_from(folder).resumed_at_step == FIRST
+    assert not harm.exists()
+
+
+NAMES = ("../../../secret.safetensors", "/etc/passwd", "learner.safetensors/../../x.safetensors", "a\0.safetensors",
+         "learner.npz", "best.pickle", "..", "", "replay-9999.safetensors", "Learner.safetensors")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_that_no_checkpoint_has_is_refused(stage, folder, name):
+    manifest = json.loads((newest(folder) / "manifest.json").read_text())
+    manifest["files"][name] = manifest["files"]["learner.safetensors"]
+    sign(newest(folder), manifest)
+    started = stage.continue_from(folder)
+    assert started.resumed_at_step == FIRST
+
+
+def test_links_and_pipes_are_not_followed(stage, folder, tmp_path):
+    path = newest(folder) / "learner.safetensors"
+    outside = tmp_path / "outside"
+    path.rename(outside)
+    for make in (lambda: path.symlink_to(outside), lambda: os.mkfifo(path), lambda: path.symlink_to("/dev/zero")):
+        make()
+        assert stage.continue_from(folder).resumed_at_step == FIRST
+        path.parent.with_suffix(".damaged").rename(path.parent)
+        path.unlink()
+
+
+def test_a_file_larger_than_memory_is_not_read(stage, folder):
+    path = newest(folder)
+    os.truncate(path / "learner.safetensors", 2**42)  # takes no room on the disk
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["files"]["learner.safetensors"]["bytes"] = 2**42
+    sign(path, manifest)
+    started = stage.continue_from(folder)
+    assert any("bytes of memory are free" in note for note in started.notes)
+    os.truncate(path.with_suffix(".damaged") / "learner.safetensors", 0)
+
+
+WRONG_ARRAYS = {
+    "learner of another type": ("learner.safetensors", {".log_alpha": np.zeros((), np.float64)}),
+    "learner of another shape": ("learner.safetensors", {".actor": np.zeros(3, np.float32)}),
+    "learner with a part missing": ("learner.safetensors", {".key": None}),
+    "window of another width": ("window.safetensors", {"metrics": np.zeros((2, 3), np.float32)}),
+    "window of another type": ("window.safetensors", {"metrics": np.zeros((2, 9), np.float64)}),
+    "no window": ("window.safetensors", {"metrics": np.zeros((), np.float32)}),
+    "best policy of another size": ("best.safetensors", {"actor": np.zeros(5, np.float32)}),
+    "no best policy": ("best.safetensors", {"actor": None}),
+    "observation of another size": ("environments.safetensors", {"0.observation": np.zeros(4, np.float32)}),
+    "no observation": ("environments.safetensors", {"1.observation": None}),
+    "simulator of another size": ("environments.safetensors", {"0.physics.state": np.zeros(9)}),
+    "simulator of another type": ("environments.safetensors", {"0.physics.state": np.zeros(2, np.float32)}),
+    "no simulator": ("environments.safetensors", {"1.physics.state": None}),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_ARRAYS)
+def test_arrays_that_do_not_fit_are_named(stage, folder, what):
+    name, changes = WRONG_ARRAYS[what]
+    change_arrays(newest(folder), name, **changes)
+    with pytest.raises(CheckpointError, match=r"cannot continue .*the checkpoint.*remove .*checkpoints"):
+        stage.continue_from(folder)
+
+
+def test_transitions_of_another_type_are_damage(stage, folder):
+    change_arrays(newest(folder), "replay-0001.safetensors", rows=np.zeros((40, 9), np.float64))
+    assert stage.continue_from(folder).resumed_at_step == FIRST
+
+
+OTHERS = (None, "text", -1, 1.5, True, [], {}, [None], 10**30, 2**63, "NaN", {"a": []}, 0)
+
+
+def places(value: object, path: tuple = ()) -> list[tuple]:
+    """The path of every entry of a JSON value."""
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path] * bool(path) + [found for key, part in inner for found in places(part, (*path, key))]
+
+
+def with_entry(value: dict, path: tuple, *new: object) -> dict:
+    """A copy with another value, or none, in one place."""
+    copy = json.loads(json.dumps(value))
+    holder = copy
+    for key in path[:-1]:
+        holder = holder[key]
+    if new:
+        holder[path[-1]] = new[0]
+    else:
+        del holder[path[-1]]
+    return copy
+
+
+def test_any_other_value_in_any_place_of_the_manifest_is_an_error_in_words(stage, folder):
+    """Every entry replaced by values of every kind, or removed, with the right checksum: never a traceback."""
+    manifest = json.loads((newest(folder) / "manifest.json").read_text())
+    shutil.rmtree(older(folder))
+    chance = random.Random(0)
+    outcomes = {"read": 0, "refused": 0}
+    everything = [(path, new) for path in places(manifest) for new in [(), *((other,) for other in OTHERS)]]
+    for path, new in chance.sample(everything, 450):
+        sign(newest(folder), with_entry(manifest, path, *new))
+        try:
+            stage.continue_from(folder)
+            outcomes["read"] += 1
+        except (TrainingFailed, UserError) as error:
+            assert str(error)
+            outcomes["refused"] += 1
+    assert outcomes["refused"] > 250, outcomes
+    sign(newest(folder), manifest)
+    assert stage.continue_from(folder).resumed_at_step == SECOND
+
+
+def test_any_other_value_in_the_configuration_is_an_error_in_words(stage, folder):
+    path = folder / "config.json"
+    config = json.loads(path.read_text())
+    for place in places(config):
+        if place[0] in ("versions", "machine") and len(place) > 1:
+            continue  # told, never used
+        for new in [(), *((other,) for other in OTHERS)]:
+            changed = with_entry(config, place, *new)
+            if changed == config:
+                continue
+            path.write_text(json.dumps(changed))
+            with pytest.raises((TrainingFailed, UserError)):
+                stage.continue_from(folder)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 100_000, b'{"format": 1}', b"1" * 5000])
+@pytest.mark.parametrize("name", ["config.json", "best/policy.json"])
+def test_a_damaged_description_is_named(stage, folder, name, content):
+    from saclab.trained_policy import load_policy
+
+    (folder / name).write_bytes(content)
+    with pytest.raises(UserError, match=name):
+        stage.continue_from(folder) if name == "config.json" else load_policy(folder)
+
+
+@pytest.mark.parametrize("content", HOSTILE)
+def test_a_policy_made_to_harm_is_refused(stage, folder, tmp_path, content):
+    from saclab.trained_policy import load_policy
+
+    harm = tmp_path / "harmed"
+    (folder / "best" / "policy.safetensors").write_bytes(HOSTILE[content](Harm(harm)))
+    with pytest.raises(UserError, match="is damaged"):
+        load_policy(folder)
+    assert not harm.exists()

@@ -279,8 +279,8 @@ class Run:
         self.learner_state = jax.tree.unflatten(structure, [jnp.asarray(array) for array in checked])
         self._actor = None
         window = groups.get("window", {}).get("metrics", np.zeros(0))
-        width = len(Metrics._fields)
-        self.window = list(require_like("metrics", window, np.zeros((len(window), width), np.float32)))
+        expected = np.zeros((*window.shape[:1], len(Metrics._fields)), np.float32)
+        self.window = list(require_like("metrics", window, expected))
         if "best" in groups:
             self.best_actor = require_like("best", groups["best"].get("actor"), self.actor)
         self.counters = Counters(**plain_numbers(state.get("counters"), dataclasses.asdict(Counters())))

@@ -17,7 +17,8 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import UnionType
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -62,11 +63,28 @@ def config_of(run: Path, content: dict[str, Any]) -> Config:
     """The configuration in what `read_config_file` read; raises UserError if there is none that works."""
     try:
         config = Config.from_dict(content["config"])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise damaged(run / "config.json", error) from error
-    if not isinstance(config.environment, str) or not isinstance(config.environment_arguments, dict):
-        raise damaged(run / "config.json", "it names no environment")
+    for settings in (config, config.algorithm, config.training):
+        for name, hint in get_type_hints(type(settings)).items():
+            value = getattr(settings, name)
+            if not fits(value, hint):
+                raise damaged(run / "config.json", f"{name} = {value!r}")
     return config
+
+
+def fits(value: object, hint: Any) -> bool:
+    """Whether a value that came from JSON is of the type of a setting."""
+    kind, arguments = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return value in arguments
+    if kind is tuple:
+        return isinstance(value, tuple) and all(fits(part, arguments[0]) for part in value)
+    if kind is UnionType:
+        return any(fits(value, argument) for argument in arguments)
+    if hint is float:
+        return type(value) in (int, float)
+    return type(value) is (kind or hint)
 
 
 def damaged(path: Path, reason: object) -> UserError:

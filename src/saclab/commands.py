@@ -110,6 +110,7 @@ class Compare:
     seeds: int | None = None
     """How many seeds, counted from first_seed; None for the protocol's own number."""
     first_seed: int = 0
+    """The other seeds follow it."""
     workers: int | None = None
     """Runs at a time; None for one per core."""
     threads: int = 1
@@ -231,7 +232,7 @@ class Report:
     out: Path = Path("report")
     """Folder to write to."""
     allow_mixed: bool = False
-    """Show runs that differ in more than variant and seed side by side, labelled by what differs; they are not pooled."""
+    """Show runs that differ in more than variant and seed side by side, labelled by what differs, never pooled."""
 
     def __call__(self, console: Console) -> int:
         from saclab.comparison.report import write_report

@@ -21,7 +21,7 @@ def machine_facts() -> dict[str, Any]:
     return {
         "versions": {package: version(package) for package in PACKAGES} | {"python": platform.python_version()},
         "machine": {
-            "system": platform.platform(),
+            "system": " ".join((platform.system(), platform.machine(), *platform.libc_ver())).strip(),
             "processor": processor_name(),
             "threads": visible_threads("NPROC"),
             "numpy_threads": visible_threads("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"),

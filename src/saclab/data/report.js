@@ -245,7 +245,13 @@
     else if (kind === "intervals") for (const chart of source.intervals) chartFigure(host, chart.title, "", (figure) => intervalChart(figure, chart));
     else for (const panel of source.panels) if (panel.group === kind) chartFigure(host, panel.title, panel.meaning, (figure) => lineChart(figure, panelChart(panel)));
   }
-  const drawAll = () => figures.forEach((draw) => draw());
+  const controls = document.getElementById("controls");
+  const drawAll = () => {
+    figures.forEach((draw) => draw());
+    // What a link or the Tab key leads to must not end up under the controls where these stay in view.
+    const covered = getComputedStyle(controls).position === "sticky" ? controls.offsetHeight : 0;
+    document.documentElement.style.scrollPaddingTop = `${covered}px`;
+  };
 
   function choice(type, name, title, checked, change, swatch) {
     const input = html("input", { type, name });
@@ -259,7 +265,7 @@
     svg("path", { class: `marker ${colour(arm)}`, d: shape(arm), transform: "translate(15 7)" }));
   const group = (title, ...choices) => html("fieldset", {}, html("legend", {}, title), ...choices);
 
-  document.getElementById("controls").append(
+  controls.append(
     group("Variants", ...data.arms.map((arm, i) => choice("checkbox", "arm", arm.title, true, toggle(state.arms, i), swatch(i)))),
     group("Over", ...Object.entries(data.axes).map(([key, title]) =>
       choice("radio", "axis", title, key === state.axis, () => { state.axis = key; }))),
@@ -269,7 +275,7 @@
       choice("checkbox", "runs", "single runs", true, (on) => { state.runs = on; })),
     html("details", {}, html("summary", {}, "Seeds"), html("fieldset", {},
       ...seeds.map((seed) => choice("checkbox", "seed", `${seed}`, true, toggle(state.seeds, seed))))));
-  document.getElementById("controls").addEventListener("submit", (event) => event.preventDefault());
+  controls.addEventListener("submit", (event) => event.preventDefault());
 
   document.getElementById("copy").addEventListener("click", async (event) => {
     const commands = document.getElementById("commands");

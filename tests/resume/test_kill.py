@@ -19,7 +19,7 @@ KILLS = 25  # on each environment
 ENVIRONMENTS = ("HalfCheetah-v4", "Humanoid-v4")
 OFTEN = ("--checkpoint-minutes", "0.005")  # every 0.3 s
 SETTINGS = tuple(settings(
-    max_steps=16_000, random_steps=100, replay_capacity=4_000, evaluation_interval_steps=1_900, update_interval=4,
+    max_steps=8_000, random_steps=100, replay_capacity=3_000, evaluation_interval_steps=1_900, update_interval=4,
 ))  # fmt: skip
 
 

@@ -225,7 +225,7 @@ def test_wrappers_without_a_state_are_no_hindrance(wrapper):
 
 
 def test_checkpoints_are_taken_every_so_many_minutes(tmp_path):
-    config = small_config("Pendulum-v1", random_steps=10, batch_size=4, max_steps=20)
+    config = small_config("Pendulum-v1", random_steps=32, max_steps=36)
     saved = [event for event in loop.train(config, tmp_path, checkpoint_minutes=0) if isinstance(event, Saved)]
-    assert len(saved) == 20
-    assert [path.name[-2:] for path in newest_first(tmp_path / "checkpoints")] == ["20", "19"]
+    assert len({event.checkpoint for event in saved}) == 37, "before the first step and after each"
+    assert [path.name[-2:] for path in newest_first(tmp_path / "checkpoints")] == ["36", "35"]

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from saclab.comparison.runs import read_comparison
-from saclab.comparison.scores import aggregate, common_horizon, environment_sentences, number_text, score_environment
+from saclab.comparison.scores import (
+    MORE_SEEDS,
+    ONE_SEED,
+    aggregate,
+    common_horizon,
+    environment_sentences,
+    number_text,
+    score_environment,
+)
 
 from .synthetic import write_run
 
@@ -84,23 +92,23 @@ def test_few_seeds_are_warned_of(tmp_path):
     assert "2 seeds cannot tell sac and averaged apart" in text or "2 seeds cannot tell averaged and sac apart" in text
 
 
-def test_one_seed_says_that_no_interval_exists(tmp_path):
-    folders = [write_run(tmp_path, variant) for variant in ("sac", "averaged")]
-    sentences = environment_sentences(scores_of(folders))
-    assert len(sentences) == 2
-    assert "with one seed each no interval exists" in sentences[0]
-    assert not any("beats" in sentence for sentence in sentences)
+@pytest.mark.parametrize("variants", [("sac", "averaged"), ("sac", "sac-auto", "averaged", "averaged-auto")])
+def test_one_seed_each_allows_no_conclusion_and_says_how_to_get_one(tmp_path, variants):
+    folders = [write_run(tmp_path, variant, returns=[1000.0 + len(variant)]) for variant in variants]
+    first, second = environment_sentences(scores_of(folders))
+    assert first == ONE_SEED
+    assert "no conclusion" in first
+    assert "--seeds 5" in first
+    levels = "; ".join(f"{variant} {number_text(1000 + len(variant))}" for variant in variants)
+    assert second == f"Final test return (one seed, no interval): {levels}."
 
 
-def test_many_pairs_without_an_interval_take_one_sentence(tmp_path):
-    folders = [write_run(tmp_path, variant) for variant in ("sac", "sac-auto", "averaged")]
-    first, *others = environment_sentences(scores_of(folders))
-    assert first.startswith("One seed only of sac, sac-auto and averaged: no interval exists")
-    assert len(others) == 1
+def test_variants_of_one_seed_among_others_take_one_sentence(tmp_path):
+    folders = [write_run(tmp_path, variant) for variant in ("sac", "sac-auto", "averaged", "averaged-auto")]
     folders += [write_run(tmp_path, variant, 1) for variant in ("sac", "averaged")]
     known, unknown, *_ = environment_sentences(scores_of(folders))
     assert "2 seeds cannot tell" in known
-    assert unknown.startswith("One seed only of sac-auto: ")
+    assert unknown == f"With one seed only, nothing can be said about sac-auto, averaged-auto. {MORE_SEEDS}"
 
 
 def test_aggregate_normalises_each_environment(tmp_path):

@@ -31,6 +31,8 @@ from saclab.training.run_folder import RunRecord
 FINAL_SHARE = 0.1
 """The final return is the mean over this last share of the tests, at least one: a single test is noisy."""
 PROFILE_POINTS = 101
+MORE_SEEDS = "More seeds can change that: compare again with --seeds 5; finished runs are kept."
+ONE_SEED = f"One seed of each variant allows no conclusion about which is better. {MORE_SEEDS}"
 
 
 class RunScore(NamedTuple):
@@ -240,9 +242,13 @@ def environment_sentences(scores: EnvironmentScores) -> list[str]:
     if not tested:
         return ["No run has a test so far, so there is nothing to compare."]
     sentences = pair_sentences(scores.pairs)
-    levels = "; ".join(f"{arm.arm.name} {interval_text(arm.final)}" for arm in tested)
-    sentences.append(f"Final test return: {levels}.")
-    fewest = min(len(arm.runs) for arm in tested)
+    fewest, most = min(len(arm.runs) for arm in tested), max(len(arm.runs) for arm in tested)
+    if most == 1:
+        levels = "; ".join(f"{arm.arm.name} {number_text(arm.final.estimate)}" for arm in tested)
+        sentences.append(f"Final test return (one seed, no interval): {levels}.")
+    else:
+        levels = "; ".join(f"{arm.arm.name} {interval_text(arm.final)}" for arm in tested)
+        sentences.append(f"Final test return: {levels}.")
     if 1 < fewest < FEW_RUNS:
         sentences.append(
             f"With fewer than {FEW_RUNS} seeds the bootstrap intervals of returns are too narrow: read them as hints."
@@ -264,17 +270,13 @@ def pair_sentences(pairs: Sequence[Pair]) -> list[str]:
     """Decided pairs first, then undecided ones; those that no interval exists for in one sentence."""
     known = [pair for pair in pairs if pair.improvement.exists]
     sentences = [pair.sentence for pair in sorted(known, key=lambda pair: not pair.improvement.decided)]
-    unknown = [pair for pair in pairs if pair not in known]
-    if len(unknown) <= 1:
-        return sentences + [pair.sentence for pair in unknown]
-    runs = {pair.x: pair.improvement.runs_x for pair in unknown} | {pair.y: pair.improvement.runs_y for pair in unknown}
-    *others, last = [arm.name for arm, count in runs.items() if count < 2]
-    alone = f"{', '.join(others)} and {last}" if others else last
-    return [
-        *sentences,
-        f"One seed only of {alone}: no interval exists, so nothing can be said about which is better. In one "
-        "environment it takes at least four seeds of each to decide anything.",
-    ]
+    runs = {pair.x: pair.improvement.runs_x for pair in pairs} | {pair.y: pair.improvement.runs_y for pair in pairs}
+    alone = [arm.name for arm, count in runs.items() if count < 2]
+    if alone and len(alone) == len(runs):
+        return [ONE_SEED]
+    if alone:
+        sentences.append(f"With one seed only, nothing can be said about {', '.join(alone)}. {MORE_SEEDS}")
+    return sentences
 
 
 def interval_text(interval: Interval) -> str:

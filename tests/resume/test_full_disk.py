@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from saclab.errors import TrainingFailed
 from saclab.training import loop
 from saclab.training.checkpoint import newest_first
 
-from .helpers import assert_same_run, finish, small_config
+from .helpers import assert_same_run, finish, small_config, stop_at
 
 
 def mount(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -20,11 +21,11 @@ def mount(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A folder that holds 300 kB."""
+    """A folder that holds a megabyte."""
     folder = tmp_path / "disk"
     folder.mkdir()
     try:
-        mounted = mount("-o", "size=300k", "tmpfs", str(folder))
+        mounted = mount("-o", "size=1m", "tmpfs", str(folder))
     except FileNotFoundError:
         pytest.skip("there is no mount command here")
     if mounted.returncode != 0:
@@ -33,28 +34,28 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(folder)], check=True)
 
 
-def test_a_full_disk_keeps_the_last_good_checkpoint_and_says_what_to_do(small_disk, tmp_path):
-    """The replay buffer grows until a third checkpoint has no room beside the two that are kept."""
-    config = small_config(
-        "Pendulum-v1", replay_capacity=10_000, max_steps=2_600, evaluation_interval_steps=2_000, update_interval=100
-    )
-    straight, folder = tmp_path / "straight", small_disk / "run"
+def fill(folder: Path, spare: int) -> Path:
+    """A file that leaves so many bytes of the disk free."""
+    free = os.statvfs(folder).f_bavail * os.statvfs(folder).f_frsize
+    (folder / "filler").write_bytes(bytes(max(0, free - spare)))
+    return folder / "filler"
+
+
+@pytest.mark.parametrize("spare", [0, 5_000, 30_000], ids=["from its first file", "in the middle", "near its end"])
+def test_a_full_disk_keeps_the_last_good_checkpoint_and_says_what_to_do(small_disk, tmp_path, spare):
+    config, straight, folder = small_config("Pendulum-v1"), tmp_path / "straight", small_disk / "run"
     finish(config, straight)
-    with pytest.raises(TrainingFailed) as error:
-        list(loop.train(config, folder, checkpoint_minutes=0))
-    kept = newest_first(folder / "checkpoints")
-    assert len(kept) == 2
-    assert not list(Path(folder / "checkpoints").glob("*.partial"))
-    message = str(error.value)
-    assert "the disk is full" in message
-    assert f"The last good checkpoint, {kept[0].name}, is kept" in message
-    assert f"make room, then continue with: saclab resume {folder}" in message
-
-    with pytest.raises(TrainingFailed, match=r"full|No space"):  # still no room: nothing is lost
-        list(loop.train(config, folder, checkpoint_minutes=0))
-    assert newest_first(folder / "checkpoints")[0].name >= kept[0].name
-
-    assert mount("-o", "remount,size=20m", "tmpfs", str(small_disk)).returncode == 0
-    resumed = finish(config, folder)
-    assert resumed[0].resumed_at_step >= int(kept[0].name.removeprefix("step-"))
+    stop_at(100, config, folder)
+    stop_at(130, config, folder)
+    filler = fill(small_disk, spare)
+    before = newest_first(folder / "checkpoints")
+    for _ in range(2):  # starting again does no harm either
+        with pytest.raises(TrainingFailed, match=r"disk is full|No space left.*make room.*saclab resume") as error:
+            list(loop.train(config, folder, checkpoint_minutes=0))
+        assert newest_first(folder / "checkpoints") == before
+        assert not list((folder / "checkpoints").glob("*.partial"))
+    if "disk is full" in str(error.value):
+        assert f"The last good checkpoint, {before[0].name}, is kept; make room" in str(error.value)
+    filler.unlink()
+    assert finish(config, folder)[0].resumed_at_step == 130
     assert_same_run(straight, folder)

@@ -173,14 +173,14 @@ def test_any_other_value_in_any_place_of_the_manifest_is_an_error_in_words(stage
     chance = random.Random(0)
     outcomes = {"read": 0, "refused": 0}
     everything = [(path, new) for path in places(manifest) for new in [(), *((other,) for other in OTHERS)]]
-    for path, new in chance.sample(everything, 250):
+    for path, new in chance.sample(everything, 120):
         sign(newest(folder), with_entry(manifest, path, *new))
         try:
             stage.continue_from(folder)
             outcomes["read"] += 1
         except (TrainingFailed, UserError):
             outcomes["refused"] += 1
-    assert outcomes["refused"] > 150, outcomes
+    assert outcomes["refused"] > 70, outcomes
     sign(newest(folder), manifest)
     assert stage.continue_from(folder).resumed_at_step == SECOND
 

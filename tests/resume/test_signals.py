@@ -36,6 +36,7 @@ def assert_whole(folder: Path) -> None:
     newest.close()
 
 
+@pytest.mark.slow
 def test_usr1_saves_and_goes_on_and_term_saves_and_stops_however_often_it_comes(tmp_path):
     process = started(tmp_path)
     process.send_signal(signal.SIGUSR1)

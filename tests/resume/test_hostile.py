@@ -166,21 +166,22 @@ def with_entry(value: dict, path: tuple, *new: object) -> dict:
     return copy
 
 
-def test_any_other_value_in_any_place_of_the_manifest_is_an_error_in_words(stage, folder):
+@pytest.mark.parametrize("count", [40, pytest.param(600, marks=pytest.mark.slow)])
+def test_any_other_value_in_any_place_of_the_manifest_is_an_error_in_words(stage, folder, count):
     """Every entry replaced by values of every kind, or removed, with the right checksum: never a traceback."""
     manifest = json.loads((newest(folder) / "manifest.json").read_text())
     shutil.rmtree(older(folder))
-    chance = random.Random(0)
+    chance = random.Random(count)
     outcomes = {"read": 0, "refused": 0}
     everything = [(path, new) for path in places(manifest) for new in [(), *((other,) for other in OTHERS)]]
-    for path, new in chance.sample(everything, 120):
+    for path, new in chance.sample(everything, count):
         sign(newest(folder), with_entry(manifest, path, *new))
         try:
             stage.continue_from(folder)
             outcomes["read"] += 1
         except (TrainingFailed, UserError):
             outcomes["refused"] += 1
-    assert outcomes["refused"] > 70, outcomes
+    assert outcomes["refused"] > count / 2, outcomes
     sign(newest(folder), manifest)
     assert stage.continue_from(folder).resumed_at_step == SECOND
 

@@ -215,7 +215,7 @@ def test_a_file_system_without_links_gets_whole_files(tmp_path, monkeypatch):
         raise OSError(95, "Operation not supported")
 
     monkeypatch.setattr(checkpoint.os, "link", no_links)
-    config = small_config("Pendulum-v1", random_steps=32, max_steps=36)
+    config = small_config("Pendulum-v1", random_steps=32, max_steps=34)
     list(loop.train(config, tmp_path, checkpoint_minutes=0))
     run = Run(config)
     assert checkpoint.load_newest_checkpoint(tmp_path / "checkpoints", run.replay, pytest.fail) is not None

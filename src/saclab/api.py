@@ -59,10 +59,27 @@ def train(
 
 
 def resume(
-    run: Path | str, on_event: Callable[[Event], None] = lambda event: None, checkpoint_minutes: float = 10
+    run: Path | str,
+    on_event: Callable[[Event], None] = lambda event: None,
+    checkpoint_minutes: float = 10,
+    imports: Sequence[str] = (),
 ) -> RunRecord:
-    """Go on with an unfinished run from its newest checkpoint; raises UserError if `run` is not a run folder."""
-    return _train(read_config(Path(run)), Path(run), on_event, checkpoint_minutes)
+    """Go on with an unfinished run from its newest checkpoint.
+
+    Args:
+        run: the run folder.
+        on_event: called with each event of `saclab.training.events`.
+        checkpoint_minutes: wall-clock time between checkpoints.
+        imports: packages that the run's environment may import.
+
+    Raises:
+        UserError: if `run` is not a run folder, or its environment would import a package not named.
+    """
+    from saclab.environments.make import require_import_allowed
+
+    config = read_config(Path(run))
+    require_import_allowed(config.environment, imports)
+    return _train(config, Path(run), on_event, checkpoint_minutes)
 
 
 def _train(config: Config, folder: Path, on_event: Callable[[Event], None], checkpoint_minutes: float) -> RunRecord:

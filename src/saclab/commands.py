@@ -82,12 +82,17 @@ class Resume:
     """Wall-clock time between checkpoints."""
     threads: int | None = None
     """Cores that XLA uses; None for as many as the run has used so far."""
+    imports: tuple[str, ...] = ()
+    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
 
     def __call__(self, console: Console) -> int:
         from saclab.training.run_folder import read_config, read_last_session
 
         config = read_config(self.run)
         limit_threads(self.threads or read_last_session(self.run)["machine"]["threads"])
+        from saclab.environments.make import require_import_allowed
+
+        require_import_allowed(config.environment, self.imports)
         return train_and_show(config, self.run, self.checkpoint_minutes, console)
 
 
@@ -189,13 +194,15 @@ class Evaluate:
     """Sample actions in place of the mean action."""
     json: bool = False
     """Print one line of JSON."""
+    imports: tuple[str, ...] = ()
+    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
 
     def __call__(self, console: Console) -> int:
         from saclab import playback
 
         if self.episodes < 1:
             raise SettingError("episodes", self.episodes, "use at least 1")
-        result = playback.evaluate(self.run, self.episodes, self.seed, deterministic=not self.stochastic)
+        result = playback.evaluate(self.run, self.episodes, self.seed, not self.stochastic, self.imports)
         console.print(json.dumps(result._asdict()) if self.json else result.sentence(), soft_wrap=True, highlight=False)
         return 0
 
@@ -214,12 +221,15 @@ class Record:
     """Of the episode's start."""
     size: int = 320
     """Width and height in pixels."""
+    imports: tuple[str, ...] = ()
+    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
 
     def __call__(self, console: Console) -> int:
         from saclab import playback
 
         path = self.video or self.run / "best" / "video.mp4"
-        console.print(playback.record(self.run, path, self.steps, self.seed, self.size), soft_wrap=True)
+        told = playback.record(self.run, path, self.steps, self.seed, self.size, self.imports)
+        console.print(told, soft_wrap=True, markup=False)
         return 0
 
 

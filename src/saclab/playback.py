@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from saclab.environments.make import make_environment
+from saclab.environments.make import make_environment, require_import_allowed
 from saclab.errors import UserError
 from saclab.trained_policy import TrainedPolicy, load_policy, read_description
 from saclab.training.evaluation import Evaluator
@@ -34,9 +35,16 @@ class TestResult(NamedTuple):
         )
 
 
-def evaluate(run: Path, episodes: int, seed: int, deterministic: bool = True) -> TestResult:
-    """Test a run's best policy; raises UserError if it has none."""
+def evaluate(
+    run: Path, episodes: int, seed: int, deterministic: bool = True, imports: Sequence[str] = ()
+) -> TestResult:
+    """Test a run's best policy.
+
+    Raises:
+        UserError: if the run has no policy, or its environment would import a package not named in `imports`.
+    """
     policy, description = load_policy(run), read_description(run)
+    require_import_allowed(description["environment"], imports)
     evaluator = Evaluator(description["environment"], description["environment_arguments"])
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
     result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
@@ -47,17 +55,19 @@ def evaluate(run: Path, episodes: int, seed: int, deterministic: bool = True) ->
     )  # fmt: skip
 
 
-def record(run: Path, video: Path, steps: int, seed: int, size: int) -> str:
+def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Sequence[str] = ()) -> str:
     """Film the best policy from the start of an episode, at the environment's own speed; says what was filmed.
 
     Raises:
-        UserError: if the run has no policy, or the environment cannot be rendered here.
+        UserError: if the run has no policy, its environment would import a package not named in `imports`, or cannot
+            be rendered here.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     import imageio.v2 as imageio
 
     policy, description = load_policy(run), read_description(run)
+    require_import_allowed(description["environment"], imports)
     arguments: dict[str, Any] = dict(description["environment_arguments"])
     sized = arguments | {"width": size, "height": size}
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -187,6 +188,24 @@ gymnasium.register("Breaking-v0", Breaking)
     assert result.returncode == 1, result.stderr
     assert "not finite" in result.stdout
     assert (run_folder(tmp_path) / "result.json").exists()
+
+
+@pytest.mark.parametrize("command", ["resume", "evaluate", "record"])
+def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, tmp_path: Path, command: str) -> None:
+    run = tmp_path / "received"
+    shutil.copytree(run_folder(trained), run)
+    (run / "result.json").unlink()
+    for path in (run / "config.json", run / "best" / "policy.json"):
+        path.write_text(path.read_text().replace('"Pendulum-v1"', '"trap:Pendulum-v1"'))
+    (tmp_path / "trap.py").write_text("open('sprung', 'w').close()")
+    refused = saclab(command, str(run), folder=tmp_path)
+    assert refused.returncode == 2
+    assert "--imports trap" in refused.stderr
+    assert not (tmp_path / "sprung").exists()
+    if command == "evaluate":
+        allowed = saclab(command, str(run), "--episodes", "1", "--imports", "trap", folder=tmp_path)
+        assert allowed.returncode == 0, allowed.stderr
+        assert (tmp_path / "sprung").exists()
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -56,6 +56,16 @@ def make_environment(
         made.close()
         raise
     return made
+
+
+def require_import_allowed(environment: str, imports: Sequence[str]) -> None:
+    """Refuse an id read from disk that would import a package which the user has not named: importing runs code."""
+    package, colon, _ = environment.rpartition(":")
+    if colon and package not in imports:
+        raise UserError(
+            f"this run's environment is {environment!r}, which imports the package {package}: if you trust it, add "
+            f"--imports {package}"
+        )
 
 
 @contextmanager

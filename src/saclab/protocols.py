@@ -59,7 +59,7 @@ PROTOCOLS: dict[str, Protocol] = {
             random_steps=2_000,
             update_interval=2,
             replay_capacity=100_000,
-            max_updates=16_000,
+            max_updates=20_000,
             evaluation_interval_steps=2_000,
             evaluation_episodes=5,
         ),

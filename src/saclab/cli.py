@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -23,6 +24,7 @@ from saclab.commands import (
 )
 from saclab.errors import UserError
 from saclab.protocols import make_config
+from saclab.signals import EXIT_STATUS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"saclab: {error}", file=sys.stderr)
         return EXIT_USER_ERROR
+    except KeyboardInterrupt:  # outside training, where there is nothing to save
+        return EXIT_STATUS[signal.SIGINT]
 
 
 def parse(arguments: Sequence[str]) -> Any:

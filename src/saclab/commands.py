@@ -313,7 +313,7 @@ def train_and_show(
 
     if is_finished(folder):
         console.print(f"{folder} is finished already; its results are kept", soft_wrap=True, markup=False)
-    with requests_from_signals() as requests:
+    with requests_from_signals(process_ends=True) as requests:
         stream = train(config, folder, requests, checkpoint_minutes)
         if tensorboard:
             stream = trackers.tensorboard(stream)

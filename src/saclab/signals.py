@@ -15,11 +15,15 @@ EXIT_STATUS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
 
 
 @contextmanager
-def requests_from_signals() -> Iterator[Requests]:
+def requests_from_signals(process_ends: bool = False) -> Iterator[Requests]:
     """Requests that SIGINT and SIGTERM (save and stop) and SIGUSR1 (save and go on) fill in.
 
     A second signal changes nothing, so it is harmless during a save. Outside the main thread, where Python cannot
     handle signals, the requests stay as they are.
+
+    Args:
+        process_ends: a process that was asked to stop ends right after this; a signal that comes still later, while
+            Python shuts down, must not change its exit status.
     """
     requests = Requests()
 
@@ -38,4 +42,4 @@ def requests_from_signals() -> Iterator[Requests]:
         yield requests
     finally:
         for number, handler in previous.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if process_ends and requests.stop else handler)

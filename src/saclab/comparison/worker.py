@@ -24,7 +24,7 @@ def main() -> int:
         except BrokenPipeError:  # the launcher is gone: nobody would look after this run
             requests.stop = requests.stop or 1
 
-    with requests_from_signals() as requests:
+    with requests_from_signals(process_ends=True) as requests:
         try:
             config = Config.from_dict(task["config"])
             for event in train(config, Path(task["folder"]), requests, task["checkpoint_minutes"]):

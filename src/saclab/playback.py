@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,12 +68,7 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
 
     policy, description = load_policy(run), read_description(run)
     require_import_allowed(description["environment"], imports)
-    arguments: dict[str, Any] = dict(description["environment_arguments"])
-    sized = arguments | {"width": size, "height": size}
-    try:
-        environment = make_environment(description["environment"], sized, render_mode="rgb_array")
-    except UserError:  # not every environment can be told a size
-        environment = make_environment(description["environment"], arguments, render_mode="rgb_array")
+    environment = filmed_environment(description["environment"], description["environment_arguments"], size)
     environment.reset(seed=seed)
     require_rendering(environment, description["environment"])
     frames_per_second = environment.metadata.get("render_fps", 30)
@@ -88,6 +83,19 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
         environment.close()
     partial.replace(video)
     return f"{video}: {filmed} steps, return {total_reward:.1f} until then"
+
+
+def filmed_environment(name: str, arguments: Mapping[str, Any], size: int) -> Any:
+    """The environment with a camera of `size` × `size` pixels, or with its own where it cannot be told one.
+
+    Gymnasium's default camera stands still and the robot runs out of the picture: the one that MuJoCo's models call
+    "track" follows it.
+    """
+    view = {"camera_name": "track"} | dict(arguments) | {"width": size, "height": size}
+    try:
+        return make_environment(name, view, render_mode="rgb_array")
+    except UserError:
+        return make_environment(name, arguments, render_mode="rgb_array")
 
 
 def require_rendering(environment: Any, name: str) -> None:

@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-slow check lint format types benchmark clean
+.PHONY: quickstart test test-slow check lint format types clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick

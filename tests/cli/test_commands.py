@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -14,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from saclab.training.run_folder import read_run
 
 SMALL = ("--random-steps", "200", "--batch-size", "32", "--hidden-layers", "16", "16", "--evaluation-episodes", "2")
 SHORT = (*SMALL, "--max-updates", "300", "--evaluation-interval-steps", "250", "--log-interval", "50")
@@ -95,6 +98,20 @@ def test_report_reads_run_folders(trained: Path) -> None:
     result = saclab("report", "runs", "--out", "elsewhere", folder=trained)
     assert result.returncode == 0, result.stderr
     assert (trained / "elsewhere" / "index.html").is_file()
+
+
+def test_reproduce_forecasts_the_time_runs_the_papers_protocol_and_says_that_it_is_scaled_down(tmp_path: Path) -> None:
+    arguments = ("reproduce", "--environments", "Pendulum-v1", "--variants", "sac", "--seeds", "1", "--updates", "20")
+    result = saclab(*arguments, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "1 of 1 runs to do" in result.stdout
+    assert re.search(r"forecast: about \d+ minutes with \d+ worker", result.stdout)
+    run = read_run(tmp_path / "runs/Pendulum-v1/sac/paper/seed-0")
+    assert run.config.training.update_interval == 5
+    assert run.config.training.q_bias_episodes == 2
+    assert len(run.q_bias["evaluation"]) == len(run.evaluations["evaluation"]) > 0
+    assert "Scaled down" in (tmp_path / "runs/report/index.html").read_text()
+    assert "runs to do" not in saclab(*arguments, folder=tmp_path).stdout, "nothing is left to do"
 
 
 def test_variants_and_protocols_are_listed(tmp_path: Path) -> None:

@@ -80,10 +80,13 @@ def measure(config: Config) -> Cost:
     """Train for a moment: nothing is written."""
     from saclab.training.run import Run
 
-    few_random_steps = dataclasses.replace(config.training, random_steps=config.algorithm.batch_size)
-    run = Run(dataclasses.replace(config, training=few_random_steps))
+    random_steps = config.algorithm.batch_size
+    without_end = dataclasses.replace(
+        config.training, random_steps=random_steps, max_updates=None, max_steps=sys.maxsize
+    )
+    run = Run(dataclasses.replace(config, training=without_end))
     began = time.perf_counter()
-    while run.counters.steps < few_random_steps.random_steps:
+    while run.counters.steps < random_steps:
         run.step()
     per_step = (time.perf_counter() - began) / run.counters.steps
     while run.counters.updates < WARM_UPDATES:

@@ -117,14 +117,14 @@ class Session:
             if self.requests.stop:
                 yield from self._stop()
                 return
+            if (reason := run.finish_reason()) is not None:
+                break  # before a save that comes by the clock: the last checkpoint is the one after the last test
             now = time.monotonic()
             if self.requests.save or now - self.last_save > self.checkpoint_seconds:
                 yield self._save()
             if now - self.last_progress > PROGRESS_SECONDS:
                 self.last_progress = now
                 yield self._progress()
-            if (reason := run.finish_reason()) is not None:
-                break
             for episode in run.step():
                 yield from self._log_episode(episode)
             yield from self._log_updates()

@@ -6,11 +6,12 @@ import csv
 import hashlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from unittest import mock
 
@@ -143,11 +144,18 @@ def environment_of(threads: int | None = 1) -> dict[str, str]:
 
 
 def start(folder: Path, *arguments: str, threads: int | None = 1) -> subprocess.Popen[str]:
-    """`saclab` with these arguments in `folder`, its output in a pipe."""
+    """`saclab` with these arguments in `folder`, in a process group of its own, its output in a pipe."""
     return subprocess.Popen(
         command(*arguments), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        env=environment_of(threads),
+        env=environment_of(threads), process_group=0,
     )  # fmt: skip
+
+
+def kill(process: subprocess.Popen[str]) -> None:
+    """`kill -9` on the process and its helpers: `import glfw` asks a child of its own, which would complain."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def run(folder: Path, *arguments: str, threads: int | None = 1, status: int = 0) -> str:

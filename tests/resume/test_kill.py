@@ -13,7 +13,7 @@ import pytest
 
 from saclab.training.checkpoint import newest_first
 
-from .helpers import assert_same_run, lines_of, run, settings, start, wait_for
+from .helpers import assert_same_run, kill, lines_of, run, settings, start, wait_for
 
 KILLS = 25  # on each environment
 ENVIRONMENTS = ("HalfCheetah-v4", "Humanoid-v4")
@@ -50,8 +50,7 @@ def kill_at_some_instant(process: subprocess.Popen[str], folder: Path, chance: r
         else:
             time.sleep(chance.uniform(0, 1.0))
     caught = partial(folder)
-    process.kill()
-    process.wait()
+    kill(process)
     return "during a save" if caught and partial(folder) else how if how != "during a save" else "after a save"
 
 

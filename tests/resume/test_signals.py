@@ -12,7 +12,7 @@ from saclab.training.checkpoint import newest_first, read_checkpoint
 from saclab.training.run import Run
 from saclab.training.run_folder import read_config
 
-from .helpers import assert_same_run, run, settings, start, wait_for
+from .helpers import assert_same_run, kill, run, settings, start, wait_for
 
 # Tests of twenty episodes are under way most of the time: no one should have to wait for their end.
 LONG = tuple(settings(
@@ -98,7 +98,7 @@ def interrupted(folder: Path, threads: int):
     process = start(folder, *command_of(threads, "--checkpoint-minutes", "0.001"), threads=None)
     run_folder = folder / WIDE_RUN
     wait_for(lambda: any(newest.name >= "step-000000000400" for newest in newest_first(run_folder / "checkpoints")))
-    process.kill()
+    kill(process)
     process.communicate()
     return process, run_folder
 

@@ -135,6 +135,19 @@ def test_an_mlp_by_hand():
     assert network.apply(parameters, np.array([[1.0, 1.0], [-1.0, 0.0]])).tolist() == [[-0.5], [-7.5]]
 
 
+def test_inputs_that_belong_side_by_side_may_come_apart():
+    network = NETWORKS["mlp"](3, (5,), 2, "tanh")
+    parameters = np.asarray(network.init(jax.random.PRNGKey(0)))
+    x = np.random.default_rng(0).standard_normal((4, 3)).astype(np.float32)
+    whole = network.apply(parameters, x)
+    np.testing.assert_allclose(network.apply(parameters, x[:, :2], x[:, 2:]), whole, rtol=1e-5)
+
+    def total(*inputs):
+        return jnp.sum(network.apply(jnp.asarray(parameters), *inputs))
+
+    np.testing.assert_allclose(jax.grad(total, 1)(x[:, :2], x[:, 2:]), jax.grad(total)(x)[:, 2:], rtol=1e-5)
+
+
 def test_weights_and_biases_start_uniform_within_one_over_the_root_of_the_inputs():
     network = NETWORKS["mlp"](100, (400,), 1, "relu")
     first = np.asarray(network.init(jax.random.PRNGKey(0)))[: 101 * 400]

@@ -8,7 +8,9 @@ as well as JAX arrays (the array API standard), so a policy acts on the CPU with
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
+from functools import reduce
+from itertools import accumulate, pairwise
+from operator import add
 from typing import Any, NamedTuple
 
 import jax
@@ -19,10 +21,14 @@ Array = Any  # a NumPy or a JAX array of the kind given
 
 
 class Network(NamedTuple):
-    """`init(key) -> f32[P]` and `apply(f32[P], f32[..., inputs]) -> f32[..., outputs]`."""
+    """`init(key) -> f32[P]` and `apply(f32[P], *inputs) -> f32[..., outputs]`.
+
+    The inputs f32[..., I] may come as several arrays that belong side by side. Each then meets its own rows of the
+    first layer, and a gradient with respect to one of them costs nothing for the others.
+    """
 
     init: Callable[[jax.Array], jax.Array]
-    apply: Callable[[Array, Array], Array]
+    apply: Callable[..., Array]
     parameters: int
     """P."""
 
@@ -59,6 +65,7 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 def mlp(inputs: int, hidden_layers: tuple[int, ...], outputs: int, activation: str) -> Network:
     """A multi-layer perceptron; weights and biases start uniform in ±1/√inputs of the layer, as PyTorch's do."""
     layers = list(pairwise((inputs, *hidden_layers, outputs)))
+    *boundaries, size = accumulate(part for fan_in, fan_out in layers for part in (fan_in * fan_out, fan_out))
     nonlinearity = ACTIVATIONS[activation]
 
     def init(key: jax.Array) -> jax.Array:
@@ -68,17 +75,21 @@ def mlp(inputs: int, hidden_layers: tuple[int, ...], outputs: int, activation: s
             parts.append(jax.random.uniform(layer_key, ((fan_in + 1) * fan_out,), minval=-bound, maxval=bound))
         return jnp.concatenate(parts)
 
-    def apply(parameters: Array, x: Array) -> Array:
-        start = 0
-        for index, (fan_in, fan_out) in enumerate(layers):
-            weights_end, end = start + fan_in * fan_out, start + (fan_in + 1) * fan_out
-            x = x @ parameters[start:weights_end].reshape(fan_in, fan_out) + parameters[weights_end:end]
-            if index < len(layers) - 1:
-                x = nonlinearity(x)
-            start = end
-        return x
+    def apply(parameters: Array, *inputs: Array) -> Array:
+        # The gradient of one split is one concatenation; that of as many slices would be a sum of padded vectors.
+        parts = iter(parameters.__array_namespace__().split(parameters, boundaries))
+        x: tuple[Array, ...] = inputs
+        for fan_in, fan_out in layers[:-1]:
+            x = (nonlinearity(product(x, next(parts).reshape(fan_in, fan_out)) + next(parts)),)
+        return product(x, next(parts).reshape(layers[-1])) + next(parts)
 
-    return Network(init, apply, sum((fan_in + 1) * fan_out for fan_in, fan_out in layers))
+    return Network(init, apply, size)
+
+
+def product(inputs: tuple[Array, ...], weights: Array) -> Array:
+    """[input_1, input_2, …] @ weights, without putting the inputs into one array."""
+    ends = accumulate(part.shape[-1] for part in inputs)
+    return reduce(add, (part @ weights[end - part.shape[-1] : end] for part, end in zip(inputs, ends, strict=True)))
 
 
 NETWORKS: dict[str, Callable[[int, tuple[int, ...], int, str], Network]] = {"mlp": mlp}

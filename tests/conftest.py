@@ -28,6 +28,7 @@ from saclab.config import AlgorithmSettings
 from saclab.variants import VARIANTS, variant_settings
 
 jax.config.update("jax_disable_most_optimizations", True)
+jax.config.update("jax_enable_compilation_cache", False)  # what is compiled so is for no one else
 
 OBSERVATION_SIZE, ACTION_SIZE = 3, 2
 

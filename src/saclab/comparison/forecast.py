@@ -78,8 +78,10 @@ def measure_in_process(configs: Sequence[Config], threads: int) -> list[Cost]:
 
 def measure(config: Config) -> Cost:
     """Train for a moment: nothing is written."""
+    from saclab.training.process import prepare_process
     from saclab.training.run import Run
 
+    prepare_process()
     random_steps = config.algorithm.batch_size
     without_end = dataclasses.replace(
         config.training, random_steps=random_steps, max_updates=None, max_steps=sys.maxsize

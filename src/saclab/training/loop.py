@@ -32,6 +32,7 @@ from saclab.training.events import (
 from saclab.training.failure import write_failure
 from saclab.training.lock import locked
 from saclab.training.machine import different_facts, machine_facts
+from saclab.training.process import prepare_process
 from saclab.training.requests import Requests
 from saclab.training.run import Run, Stopped
 from saclab.training.run_folder import FORMAT, Logs, append_line, is_finished, read_config
@@ -59,6 +60,7 @@ def train(
     if is_finished(folder):
         require_same_config(folder, config)
         return
+    prepare_process()
     with closing(Run(config)) as run:  # before the folder is touched: bad input leaves nothing behind
         try:
             with locked(folder), closing(Session(run, folder, requests or Requests(), checkpoint_minutes)) as session:

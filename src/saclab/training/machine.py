@@ -35,15 +35,29 @@ def visible_threads(*variables: str) -> int:
     for variable in variables:
         if (value := os.environ.get(variable, "")).isdecimal() and int(value) > 0:
             return int(value)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(usable_cores())
+
+
+def usable_cores() -> list[int]:
+    """The cores that this process may use, by their numbers."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 
 
 def processor_name() -> str:
     """The model, as compilers choose instructions by it; the architecture where the system does not tell more."""
+    return processor_entry("model name") or platform.machine()
+
+
+def processor_features() -> str:
+    """All that compilers choose instructions by, as far as the system tells it."""
+    return f"{platform.machine()} {processor_name()} {processor_entry('flags') or processor_entry('Features')}"
+
+
+def processor_entry(name: str) -> str:
+    """An entry of the first processor in Linux's list; empty where there is none."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text(errors="replace").splitlines() if information.exists() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
 
 
 def different_facts(saved: object) -> list[str]:

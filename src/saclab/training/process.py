@@ -1,0 +1,61 @@
+"""How a process is set up for training: it keeps the memory it has freed, and compiles nothing twice."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental.compilation_cache import compilation_cache
+from jaxlib import version as jaxlib_version
+
+from saclab.training.machine import processor_features, visible_threads
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+KEPT_BYTES = 2**28  # larger blocks, such as most replay buffers, still come from the system and go back to it
+WORTH_KEEPING_SECONDS = 0.1
+
+
+@lru_cache(maxsize=1)
+def prepare_process() -> None:
+    """Set this process up, once; the results of a run do not depend on it."""
+    keep_freed_memory()
+    use_compilation_cache()
+
+
+def keep_freed_memory() -> None:
+    """Let malloc reuse what XLA frees after every update, in place of returning it to the system.
+
+    Otherwise an update may begin with thousands of page faults. Only glibc has this problem and the cure.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, KEPT_BYTES)
+        mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def use_compilation_cache() -> None:
+    """Keep what XLA compiles in the user's cache folder, unless JAX has been told of a folder or to keep nothing."""
+    config: Any = jax.config
+    if config.jax_compilation_cache_dir or not config.jax_enable_compilation_cache:
+        return
+    folder = compilation_cache_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError:
+        return
+    config.update("jax_compilation_cache_dir", str(folder))
+    config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING_SECONDS)
+    compilation_cache.reset_cache()  # what was compiled before may have made up JAX's mind
+
+
+def compilation_cache_folder() -> Path:
+    """One for each version of jaxlib, processor and number of threads: its machine code is for no other."""
+    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    made_for = f"{processor_features()} {visible_threads('NPROC')}"
+    digest = hashlib.sha256(made_for.encode()).hexdigest()[:12]
+    return user_cache / "saclab" / "xla" / f"jaxlib-{jaxlib_version.__version__}-{digest}"

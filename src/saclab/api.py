@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ from saclab.config import Config
 from saclab.protocols import PROTOCOLS, make_config
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
+from saclab.training.machine import usable_cores
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
 
 COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
@@ -139,7 +139,7 @@ def compare(
         UserError: for a name or value that cannot work; nothing has been started then.
     """
     cells = plan(environments, variants, seeds, protocol, runs, environment_arguments, overrides)
-    workers = workers or max(1, len(os.sched_getaffinity(0)) // threads)
+    workers = workers or max(1, len(usable_cores()) // threads)
     require_startable(cells, min(workers, len(cells)))
     with requests_from_signals() as requests:
         statuses = (show or last)(launch(cells, workers, threads, requests, checkpoint_minutes))
@@ -189,7 +189,7 @@ def reproduce(
     if updates is not None:
         overrides["max_updates"] = updates
     cells = plan(environments, variants, seeds, "paper", runs, {}, overrides)
-    workers = workers or len(os.sched_getaffinity(0))
+    workers = workers or len(usable_cores())
     require_startable(cells, min(workers, len(cells)))
     left = sum(not cell.finished for cell in cells)
     if left:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 from saclab.comparison.grid import Cell, make_grid
-from saclab.comparison.launch import RunStatus, launch
+from saclab.comparison.launch import RunStatus, core_groups, launch
+from saclab.training.machine import usable_cores
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished
 
@@ -52,6 +54,28 @@ def test_a_stopped_grid_goes_on_where_it_was(tmp_path: Path) -> None:
     assert [status.status for status in statuses] == ["finished", "finished"]
     sessions = [(cell.folder / "sessions.jsonl").read_text().count("\n") for cell in cells]
     assert max(sessions) == 2, "at least the run that had begun was continued, not begun again"
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not hold processes to cores")
+def test_workers_that_fill_the_machine_keep_to_their_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    told = "import atexit, os; f = open(f'{os.path.dirname(__file__)}/cores-{os.getpid()}', 'w')\n"
+    (tmp_path / "sitecustomize.py").write_text(
+        told + "atexit.register(lambda: print(*sorted(os.sched_getaffinity(0)), file=f))\n"
+    )
+    cores = usable_cores()
+    for _ in launch(grid(tmp_path), workers=len(cores), threads=1, requests=Requests()):
+        pass
+    kept = {tuple(map(int, path.read_text().split())) for path in tmp_path.glob("cores-*")} - {()}
+    assert kept <= {(core,) for core in cores}
+    assert len(kept) == min(2, len(cores))
+
+
+def test_fewer_or_more_workers_than_cores_are_left_to_the_system() -> None:
+    cores = len(usable_cores())
+    assert core_groups(cores + 1, 1) == [[] for _ in range(cores + 1)]
+    assert core_groups(cores, 2) == [[] for _ in range(cores)]
+    assert core_groups(1, cores) == [usable_cores()]
 
 
 def test_a_worker_that_dies_is_a_failed_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

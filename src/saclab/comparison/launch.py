@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import IO, Literal
 
 from saclab.comparison.grid import Cell
+from saclab.training.machine import usable_cores
 from saclab.training.requests import Requests
 
 Status = Literal["waiting", "running", "finished", "interrupted", "failed"]
@@ -80,12 +81,13 @@ def launch(
     statuses = [RunStatus(cell, "finished", 1.0) if cell.finished else RunStatus(cell) for cell in cells]
     waiting = [status for status in statuses if status.status == "waiting"]
     running: dict[int, Worker] = {}
+    free_cores = core_groups(workers, threads)
     stopping = False
     with selectors.DefaultSelector() as selector:
         try:
             while running or (waiting and not requests.stop):
                 while waiting and len(running) < workers and not requests.stop:
-                    worker = Worker(waiting.pop(0), threads, checkpoint_minutes)
+                    worker = Worker(waiting.pop(0), threads, free_cores.pop(0), checkpoint_minutes)
                     running[worker.output.fileno()] = worker
                     selector.register(worker.output, selectors.EVENT_READ)
                 if requests.stop and not stopping:
@@ -97,6 +99,7 @@ def launch(
                     if not worker.read():
                         selector.unregister(worker.output)
                         del running[key.fd]
+                        free_cores.append(worker.cores)
                         worker.ended(stopping)
                 yield statuses
         finally:
@@ -110,9 +113,9 @@ def launch(
 class Worker:
     """A process that trains one run."""
 
-    def __init__(self, status: RunStatus, threads: int, checkpoint_minutes: float) -> None:
+    def __init__(self, status: RunStatus, threads: int, cores: list[int], checkpoint_minutes: float) -> None:
         """Start it, out of reach of the terminal's Ctrl-C: the launcher tells it when to stop."""
-        self.status = status
+        self.status, self.cores = status, cores
         status.status = "running"
         folder = status.cell.folder
         folder.mkdir(parents=True, exist_ok=True)
@@ -131,6 +134,7 @@ class Worker:
             "config": status.cell.config.to_dict(),
             "folder": str(folder),
             "checkpoint_minutes": checkpoint_minutes,
+            "cores": cores,
         }
         with suppress(BrokenPipeError):  # it is dead already: `ended` will say how
             self.process.stdin.write(json.dumps(task).encode())
@@ -166,6 +170,18 @@ class Worker:
             self.status.status = "failed"
             how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
             self.status.message = f"worker ended with {how}" + (f": {last_lines[-1]}" if last_lines else "")
+
+
+def core_groups(workers: int, threads: int) -> list[list[int]]:
+    """The cores that each worker keeps to; empty lists leave them to the system.
+
+    Only workers that fill the machine are held to their cores: the process that steps the environments and XLA's
+    thread then share one, and its cache. Fewer would meet those of another grid on the same cores.
+    """
+    cores = usable_cores()
+    if len(cores) != workers * threads or not hasattr(os, "sched_setaffinity"):
+        return [[] for _ in range(workers)]
+    return [cores[first : first + threads] for first in range(0, len(cores), threads)]
 
 
 def thread_limits(threads: int) -> dict[str, str]:

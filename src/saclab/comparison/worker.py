@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from saclab.errors import TrainingFailed, UserError
 def main() -> int:
     """Train the run; exit status 0 if it finished or was stopped on request, 2 for a user's error, 1 for any other."""
     task = json.load(sys.stdin)
+    if task["cores"]:
+        os.sched_setaffinity(0, task["cores"])  # before JAX starts its threads, which inherit it
     from saclab.signals import requests_from_signals
     from saclab.training.events import Evaluated, Finished, Interrupted, Progress, Started, Warned
     from saclab.training.loop import train

@@ -116,6 +116,9 @@ class TrainingSettings:
     """N: environment steps between two rounds of updates."""
     updates_per_interval: int = 1
     """Updates in each round; updates_per_interval / update_interval is the update-to-data ratio."""
+    acting_delay: int = 0
+    """Rounds of updates by which the policy that acts is behind: 0 is the textbook's, 1 lets the environments be
+    stepped while a round is computed, which saves time where there is more than one core."""
     replay_capacity: int = 1_000_000
     """Transitions that the replay buffer holds; the oldest is overwritten."""
 
@@ -149,6 +152,7 @@ class TrainingSettings:
         for name in optional:
             value = getattr(self, name)
             require(value is None or value >= 1, name, value, "use a whole number of at least 1, or leave it out")
+        require(self.acting_delay in (0, 1), "acting_delay", self.acting_delay, "use 0 or 1")
         for name in ("random_steps", "q_bias_episodes"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "use 0 or more")
         require(

@@ -55,6 +55,10 @@ def straight(tmp_path_factory):
     return config, folder, finish(config, folder)
 
 
+def test_a_run_whose_policy_acts_late_continues_exactly(tmp_path):
+    assert_exact(small_config("Hopper-v4", acting_delay=1, update_interval=7), tmp_path)
+
+
 def test_three_environments_continue_exactly(straight, tmp_path):
     config, folder, _ = straight
     vanish_after(HALF, config, tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import jax
@@ -251,3 +252,26 @@ def test_an_update_that_is_not_finite_is_named_with_its_metrics(run):
     assert run.window_array().shape == (2, len(Metrics._fields))
     run.window = []
     assert run.window_array().shape == (0, len(Metrics._fields))
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_the_policy_that_acts_is_as_many_rounds_behind_as_it_should(delay):
+    run = Run(tiny_config(acting_delay=delay, updates_per_interval=2))
+    after_rounds = [run.actor.tobytes()]
+    while run.counters.updates < 8:
+        rounds = run.counters.updates // 2
+        expected = after_rounds[max(0, rounds - delay)]
+        assert run.acting.tobytes() == expected
+        if run.counters.steps >= run.config.training.random_steps:
+            noise = copy.deepcopy(run.exploration).standard_normal((1, run.spec.action_size), np.float32)
+            chosen = run.policy.act(np.frombuffer(expected, np.float32), run.environments.observation.copy(), noise)
+            position = run.replay.added
+            run.step()
+            stored = run.replay.layout.unpack(run.replay.rows[position : position + 1]).action
+            np.testing.assert_array_equal(stored, chosen)
+        else:
+            run.step()
+        if run.counters.updates // 2 > rounds:
+            after_rounds.append(np.array(run.learner_state.actor).tobytes())
+    assert len(set(after_rounds)) == 5
+    run.close()

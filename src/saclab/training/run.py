@@ -91,6 +91,7 @@ class Run:
         """Metrics f32[M] of the updates since the last line of metrics.jsonl."""
         self.best_actor: np.ndarray | None = None
         self._actor: np.ndarray | None = None
+        self._actor_before: np.ndarray | None = None
 
     @property
     def actor(self) -> np.ndarray:
@@ -98,6 +99,16 @@ class Run:
         if self._actor is None:
             self._actor = np.array(self.learner_state.actor)
         return self._actor
+
+    @property
+    def acting(self) -> np.ndarray:
+        """The parameters f32[P] that choose the actions: with a delay, those before the last round of updates.
+
+        Nothing has to wait then for the round, which XLA computes while the environments are stepped.
+        """
+        if self.config.training.acting_delay == 0 or self._actor_before is None:
+            return self.actor
+        return self._actor_before
 
     def step(self) -> list[EndedEpisode]:
         """Step every environment once, store the transitions, make the updates due; the episodes that ended."""
@@ -108,7 +119,10 @@ class Run:
             raise
         self.replay.add(transitions)
         self.counters.steps += len(self.environments)
-        while self.counters.updates < self.config.training.updates_due(self.counters.steps):
+        updates_due = self.config.training.updates_due(self.counters.steps)
+        if self.counters.updates < updates_due:
+            self._actor_before = self.actor
+        while self.counters.updates < updates_due:
             rows = self.replay.sample(self.sampling, self.config.algorithm.batch_size)
             self.learner_state, metrics = self.update(self.learner_state, rows)
             self.window.append(metrics)
@@ -122,7 +136,7 @@ class Run:
         if self.counters.steps < self.config.training.random_steps:
             return self.exploration.uniform(-1, 1, shape).astype(np.float32)
         noise = self.exploration.standard_normal(shape, np.float32)
-        action: np.ndarray = self.policy.act(self.actor, self.environments.observation, noise)
+        action: np.ndarray = self.policy.act(self.acting, self.environments.observation, noise)
         return action
 
     def count_episode(self, episode: EndedEpisode) -> int:
@@ -255,6 +269,8 @@ class Run:
         }
         if self.best_actor is not None:
             groups["best"] = {"actor": self.best_actor}
+        if self.config.training.acting_delay:
+            groups["acting"] = {"actor": self.acting}
         state = {
             "counters": dataclasses.asdict(self.counters),
             "environments": environment_states,
@@ -281,6 +297,8 @@ class Run:
         window = groups.get("window", {}).get("metrics", np.zeros(0))
         expected = np.zeros((*window.shape[:1], len(Metrics._fields)), np.float32)
         self.window = list(require_like("metrics", window, expected))
+        if self.config.training.acting_delay:
+            self._actor_before = require_like("acting", groups.get("acting", {}).get("actor"), self.actor)
         if "best" in groups:
             self.best_actor = require_like("best", groups["best"].get("actor"), self.actor)
         self.counters = Counters(**plain_numbers(state.get("counters"), dataclasses.asdict(Counters())))

@@ -6,7 +6,9 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,7 +18,8 @@ from saclab.errors import SettingError, UserError, unknown_name
 from saclab.variants import task_name
 
 
-class EnvironmentSpec(NamedTuple):
+@dataclass(frozen=True)
+class EnvironmentSpec:
     """What a learner and a policy must know of an environment."""
 
     observation_size: int
@@ -28,9 +31,13 @@ class EnvironmentSpec(NamedTuple):
 
     def scale_action(self, action: np.ndarray) -> np.ndarray:
         """Actions [..., A] in [-1, 1] to the environment's bounds, clipped against rounding."""
-        middle, half = (self.action_high + self.action_low) / 2, (self.action_high - self.action_low) / 2
-        scaled: np.ndarray = np.clip(middle + half * action, self.action_low, self.action_high)
-        return scaled.astype(self.action_low.dtype)
+        middle, half_range = self._middle_and_half_range
+        scaled: np.ndarray = np.minimum(np.maximum(middle + half_range * action, self.action_low), self.action_high)
+        return scaled.astype(self.action_low.dtype, copy=False)
+
+    @cached_property
+    def _middle_and_half_range(self) -> tuple[np.ndarray, np.ndarray]:
+        return (self.action_high + self.action_low) / 2, (self.action_high - self.action_low) / 2
 
 
 def make_environment(

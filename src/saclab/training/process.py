@@ -15,7 +15,7 @@ from jaxlib import version as jaxlib_version
 
 from saclab.training.machine import processor_features, visible_threads
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 KEPT_BYTES = 2**28  # larger blocks, such as most replay buffers, still come from the system and go back to it
 WORTH_KEEPING_SECONDS = 0.1
 
@@ -36,6 +36,7 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, KEPT_BYTES)
         mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+        mallopt(M_ARENA_MAX, 1)  # the others give a part back as soon as all of it is free
 
 
 def use_compilation_cache() -> None:

@@ -3,7 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: quickstart test test-slow check lint format types clean
+PEERS := .venv-peers
+
+.PHONY: quickstart test test-slow check lint format types benchmark clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
@@ -27,6 +29,18 @@ format: $(VENV)/installed
 types: $(VENV)/installed
 	$(BIN)/mypy
 
+benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other libraries: leave the machine alone for half an hour
+	$(BIN)/python benchmarks/speed.py --peers $(PEERS)/bin/python
+	$(BIN)/python benchmarks/tables.py
+	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
+	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/growth.py
+	$(BIN)/python benchmarks/memory.py
+
+$(PEERS)/installed: benchmarks/peers.txt
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/pip install --quiet --disable-pip-version-check --requirement benchmarks/peers.txt
+	touch $@
+
 $(VENV)/installed: requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --requirement requirements.lock
@@ -34,4 +48,4 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist src/*.egg-info
+	rm -rf $(VENV) $(PEERS) build dist src/*.egg-info

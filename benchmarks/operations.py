@@ -1,0 +1,51 @@
+"""How many floating-point operations the matrix products of one update need, counted in what JAX traced."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from saclab.algorithm.learner import make_learner
+from saclab.config import AlgorithmSettings
+from saclab.replay import RowLayout
+
+
+class MatrixProduct(NamedTuple):
+    """One product of an update, perhaps of a batch of matrices."""
+
+    shapes: tuple[tuple[int, ...], tuple[int, ...]]
+    operations: int
+    """A product of m×k and k×n matrices counts 2·m·k·n."""
+    multiply: Callable[[jax.Array, jax.Array], jax.Array]
+
+
+def update_operations(settings: AlgorithmSettings, layout: RowLayout) -> int:
+    """Floating-point operations of the products of one update."""
+    return sum(product.operations for product in matrix_products(settings, layout))
+
+
+def matrix_products(settings: AlgorithmSettings, layout: RowLayout) -> list[MatrixProduct]:
+    """The products of one update."""
+    learner = make_learner(settings, layout.observation_size, layout.action_size)
+    state = learner.init(jax.random.PRNGKey(0))
+    batch = layout.unpack(jnp.zeros((settings.batch_size, layout.width)))
+    return list(products_of(jax.make_jaxpr(learner.update)(state, batch).jaxpr))
+
+
+def products_of(jaxpr: Any) -> Iterator[MatrixProduct]:
+    """The products of a jaxpr, those inside its calls included."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            (contracted, _), _ = equation.params["dimension_numbers"]
+            left, right = (operand.aval.shape for operand in equation.invars)
+            count = 2 * math.prod(equation.outvars[0].aval.shape) * math.prod(left[axis] for axis in contracted)
+            yield MatrixProduct((left, right), count, partial(equation.primitive.bind, **equation.params))
+        for parameter in equation.params.values():
+            inner = getattr(parameter, "jaxpr", None)
+            if inner is not None:
+                yield from products_of(inner)

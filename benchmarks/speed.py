@@ -1,0 +1,168 @@
+"""A race: saclab, Stable-Baselines3 and SBX train the same job on this machine, in turn, and a table of the ratios.
+
+    python benchmarks/speed.py --peers .venv-peers/bin/python [--rounds 5] [--only TEXT]
+
+End to end: environment, replay, acting, updates, logging, tests and the best policy's file; each library by its own
+loop, tests side by side in all of them. Plain SAC with Table 1 of the paper. Every round runs all contestants of a case
+one after the other, so a ratio compares neighbours in time; medians over rounds are reported. Imports, compilation and
+the first updates are outside the rate and shown as the seconds from the start of the process to the first update.
+
+A case is a single run that may use all cores, or as many runs at once as there are cores, one core each: their rates
+are added. What each is compared with in the end is the machine: the time that the update's matrix products and the raw
+simulator need (machine_limit.py, measured in the same round), the steps of saclab's tests counted in.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE / "contestants"))
+from stopwatch import Job  # noqa: E402
+
+from saclab.comparison.launch import thread_limits  # noqa: E402
+from saclab.training.machine import machine_facts, usable_cores  # noqa: E402
+
+
+@dataclass(frozen=True)
+class Case:
+    environment: str
+    update_interval: int
+    grid: bool
+    """One process per core, or one process alone."""
+    timed_updates: int
+    evaluation_interval_steps: int
+    evaluation_episodes: int
+    warm_updates: int = 100
+
+    @property
+    def name(self) -> str:
+        ratio = "1:1" if self.update_interval == 1 else f"1:{self.update_interval}"
+        return f"{self.environment}, {ratio}, {'grid' if self.grid else 'single run'}"
+
+
+# Two test steps per training step, as under `paper`, where episodes last 1000 steps; windows that hold whole tests.
+CASES = [
+    Case(environment, interval, grid, timed_updates, test_interval, episodes)
+    for interval, grid, timed_updates, test_interval, episodes in (
+        (5, False, 400, 2000, 4), (1, False, 500, 500, 1), (5, True, 400, 2000, 4),
+    )
+    for environment in ("HalfCheetah-v4", "Humanoid-v4")
+]  # fmt: skip
+
+SACLAB = {
+    "saclab": (),
+    "saclab, acting_delay 1": (("acting_delay", 1),),
+    "saclab, averaged": (("variant", "averaged"),),
+}
+PEERS = {"Stable-Baselines3": "stable-baselines3", "SBX": "sbx-rl"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--peers", type=Path, required=True, help="Python of the environment that holds the peers")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--results", type=Path, default=HERE / "results" / "speed.json")
+    options = parser.parse_args()
+    cases = [case for case in CASES if options.only in case.name]
+    record: dict[str, Any] = {"date": datetime.now(UTC).isoformat(timespec="minutes"), **machine_facts(), "cases": {}}
+    record["machine"]["cores"] = len(usable_cores())
+    for turn in range(options.rounds):
+        for case in cases:
+            entry = record["cases"].setdefault(case.name, {"rounds": []})
+            entry["rounds"].append(race(case, options.peers))
+            options.results.write_text(json.dumps(record, indent=1) + "\n")
+            told = {name: round(result["updates_per_second"], 1) for name, result in entry["rounds"][-1].items()}
+            print(f"round {turn + 1}/{options.rounds}  {case.name}: {told}", flush=True)
+
+
+def race(case: Case, peers: Path) -> dict[str, dict[str, Any]]:
+    """One round: contestant -> its result; the entry `limit` is the machine's."""
+    processes = in_processes(case, lambda _: [sys.executable, str(HERE / "machine_limit.py"), case.environment])
+    results = {}
+    for name, settings in SACLAB.items():
+        if name == "saclab" or case.update_interval > 1:
+            results[name] = run(case, [sys.executable, str(HERE / "contestants" / "saclab_run.py")], settings)
+    for name, package in PEERS.items():
+        script = str(HERE / "contestants" / "stable_baselines3_run.py")
+        results[name] = run(case, [str(peers), script], package=package)
+    return {"limit": limit(case, processes, results["saclab"]["test_steps_per_step"]), **results}
+
+
+def limit(case: Case, processes: list[dict[str, Any]], test_steps_per_step: float) -> dict[str, Any]:
+    """Updates per second if nothing took time but the matrix products and the simulator."""
+    rates = {}
+    for variant in ("sac", "averaged"):
+        seconds = [
+            facts["update_operations"][variant] / facts["operations_per_second"]
+            + case.update_interval * (1 + test_steps_per_step) * facts["raw_step_seconds"]
+            for facts in processes
+        ]
+        rates[variant] = sum(1 / each for each in seconds)
+    return {"updates_per_second": rates["sac"], "averaged": rates["averaged"], "processes": processes}
+
+
+def run(
+    case: Case, command: list[str], settings: tuple[tuple[str, str | float], ...] = (), package: str | None = None
+) -> dict[str, Any]:
+    """The job of a case by one contestant; of a grid the rates and the memory are sums, the rest is the mean."""
+    with tempfile.TemporaryDirectory() as folder:
+
+        def full_command(number: int) -> list[str]:
+            job = Job(
+                case.environment, case.update_interval, case.warm_updates, case.timed_updates,
+                case.evaluation_interval_steps, case.evaluation_episodes, f"{folder}/{number}", time.time(),
+                settings=settings,
+            )  # fmt: skip
+            return [*command, job.to_json(), *([package] if package else [])]
+
+        reports = in_processes(case, full_command)
+    return {
+        "updates_per_second": sum(report["updates_per_second"] for report in reports),
+        "cpu_seconds_per_1000_updates": mean(1000 * r["cpu_seconds"] / r["updates"] for r in reports),
+        "first_update_seconds": mean(report["first_update_seconds"] for report in reports),
+        "peak_bytes": sum(report["peak_bytes"] for report in reports),
+        "versions": reports[0]["versions"],
+        "test_steps_per_step": reports[0].get("test_steps_per_step"),
+    }
+
+
+def in_processes(case: Case, command: Any) -> list[dict[str, Any]]:
+    """What the command prints as its last line, from one process, or from one on each core at the same time."""
+    cores = usable_cores()
+    places = [[core] for core in cores] if case.grid else [cores]
+    processes = [
+        subprocess.Popen(
+            command(number), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env=os.environ | (thread_limits(1) if case.grid else {}),
+            preexec_fn=lambda place=place: os.sched_setaffinity(0, place),
+        )
+        for number, place in enumerate(places)
+    ]  # fmt: skip
+    reports = []
+    for process in processes:
+        output, errors = process.communicate()
+        if process.returncode != 0:
+            sys.exit(f"{process.args} failed:\n{errors[-3000:]}")
+        reports.append(json.loads(output.splitlines()[-1]))
+    return reports
+
+
+def mean(values: Any) -> float:
+    values = list(values)
+    return float(sum(values) / len(values))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Make the tables of the README from the results: python benchmarks/tables.py [--write README.md]
+
+A table stands between `<!-- speed -->` and `<!-- /speed -->`, and is replaced.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results"
+BASE = "saclab"
+
+
+def speed_table(record: dict[str, Any]) -> str:
+    """One row per case and contestant: medians over the rounds, ratios paired within a round."""
+    machine, versions = record["machine"], record["versions"]
+    lines = [
+        f"{machine['processor']}, {machine['cores']} cores; {record['date'][:10]}; Python {versions['python']}, jax "
+        f"{versions['jax']}, mujoco {versions['mujoco']}; {peers_of(record)}. Medians of "
+        f"{len(next(iter(record['cases'].values()))['rounds'])} alternating rounds (lowest and highest in brackets).",
+        "",
+        "| case | | updates/s | share of the limit | saclab is faster by | CPU s per 1000 updates | first update, s "
+        "| peak, MiB |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for case, entry in record["cases"].items():
+        rounds = entry["rounds"]
+        for name in [name for name in rounds[0] if name != "limit"]:
+            lines.append("| " + " | ".join(row(case if name == BASE else "", name, rounds)) + " |")
+    return "\n".join(lines)
+
+
+def row(case: str, name: str, rounds: list[dict[str, Any]]) -> list[str]:
+    rates = [entry[name]["updates_per_second"] for entry in rounds]
+    limit = "averaged" if name.endswith("averaged") else "updates_per_second"
+    share = statistics.median(entry[name]["updates_per_second"] / entry["limit"][limit] for entry in rounds)
+    ratio = statistics.median(entry[BASE]["updates_per_second"] / entry[name]["updates_per_second"] for entry in rounds)
+
+    def median(key: str) -> float:
+        return statistics.median(entry[name][key] for entry in rounds)
+
+    return [
+        case, name, f"{statistics.median(rates):.0f} ({min(rates):.0f}–{max(rates):.0f})", f"{share:.2f}",
+        "" if name == BASE else f"{ratio:.2f}×", f"{median('cpu_seconds_per_1000_updates'):.1f}",
+        f"{median('first_update_seconds'):.1f}", f"{median('peak_bytes') / 2**20:.0f}",
+    ]  # fmt: skip
+
+
+def peers_of(record: dict[str, Any]) -> str:
+    found: dict[str, str] = {}
+    for entry in record["cases"].values():
+        for result in entry["rounds"][0].values():
+            found |= {
+                k: v for k, v in result.get("versions", {}).items() if k in ("stable-baselines3", "sbx-rl", "torch")
+            }
+    return ", ".join(f"{name} {version}" for name, version in sorted(found.items()))
+
+
+def replace_between(text: str, name: str, table: str) -> str:
+    before, start, rest = text.partition(f"<!-- {name} -->")
+    _, end, after = rest.partition(f"<!-- /{name} -->")
+    if not (start and end):
+        raise SystemExit(f"no place for the table: <!-- {name} --> … <!-- /{name} --> is missing")
+    return f"{before}{start}\n{table}\n{end}{after}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", type=Path, help="the file to put the table into; printed otherwise")
+    options = parser.parse_args()
+    table = speed_table(json.loads((RESULTS / "speed.json").read_text()))
+    if options.write is None:
+        print(table)
+        return
+    options.write.write_text(replace_between(options.write.read_text(), "speed", table))
+
+
+if __name__ == "__main__":
+    main()

@@ -30,7 +30,7 @@ def prepare_process() -> None:
 def keep_freed_memory() -> None:
     """Let malloc reuse what XLA frees after every update, in place of returning it to the system.
 
-    Otherwise an update may begin with thousands of page faults. Only glibc has this problem and the cure.
+    Otherwise an update may begin with thousands of page faults. Done where the C library is glibc.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     if mallopt is not None:

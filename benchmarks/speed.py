@@ -1,4 +1,4 @@
-"""A race: saclab, Stable-Baselines3 and SBX train the same job on this machine, in turn, and a table of the ratios.
+"""A race: saclab and its peers train the same job on this machine, in turn, and a table of the ratios.
 
     python benchmarks/speed.py --peers .venv-peers/bin/python [--rounds 5] [--only TEXT]
 
@@ -65,7 +65,11 @@ SACLAB = {
     "saclab, acting_delay 1": (("acting_delay", 1),),
     "saclab, averaged": (("variant", "averaged"),),
 }
-PEERS = {"Stable-Baselines3": "stable-baselines3", "SBX": "sbx-rl"}
+PEERS = {
+    "Stable-Baselines3": ("stable_baselines3_run.py", "stable-baselines3"),
+    "SBX": ("stable_baselines3_run.py", "sbx-rl"),
+    "Tianshou": ("tianshou_run.py", "tianshou"),
+}
 
 
 def main() -> None:
@@ -94,9 +98,8 @@ def race(case: Case, peers: Path) -> dict[str, dict[str, Any]]:
     for name, settings in SACLAB.items():
         if name == "saclab" or case.update_interval > 1:
             results[name] = run(case, [sys.executable, str(HERE / "contestants" / "saclab_run.py")], settings)
-    for name, package in PEERS.items():
-        script = str(HERE / "contestants" / "stable_baselines3_run.py")
-        results[name] = run(case, [str(peers), script], package=package)
+    for name, (script, package) in PEERS.items():
+        results[name] = run(case, [str(peers), str(HERE / "contestants" / script)], package=package)
     return {"limit": limit(case, processes, results["saclab"]["test_steps_per_step"]), **results}
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
 BASE = "saclab"
+PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "torch")
 
 
 def speed_table(record: dict[str, Any]) -> str:
@@ -54,9 +55,7 @@ def peers_of(record: dict[str, Any]) -> str:
     found: dict[str, str] = {}
     for entry in record["cases"].values():
         for result in entry["rounds"][0].values():
-            found |= {
-                k: v for k, v in result.get("versions", {}).items() if k in ("stable-baselines3", "sbx-rl", "torch")
-            }
+            found |= {name: version for name, version in result.get("versions", {}).items() if name in PEERS}
     return ", ".join(f"{name} {version}" for name, version in sorted(found.items()))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from stopwatch import Job, Stopwatch
 
 from saclab.protocols import make_config
-from saclab.training.events import UpdatesLogged
+from saclab.training.events import Progress, UpdatesLogged
 from saclab.training.loop import train
 from saclab.training.run_folder import read_run
 
@@ -34,6 +34,8 @@ def main() -> None:
     folder = Path(job.folder) / "run"
     for event in train(config, folder):
         match event:
+            case Progress(updates=updates) if updates:
+                stopwatch.updates_made(1)  # told every 0.25 s: when the first was made, no matter how many since
             case UpdatesLogged(updates=updates):
                 stopwatch.updates_made(updates)
     stopwatch.report(

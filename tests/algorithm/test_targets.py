@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from saclab.algorithm.numbers import numbers_of
 from saclab.algorithm.targets import follow, init_target, live_slot, next_value
 from saclab.algorithm.types import TargetState
 from saclab.config import AlgorithmSettings
@@ -85,7 +86,7 @@ def ring_after_each_update(snapshots: int, interval: int, updates: int) -> list[
     chosen = settings(snapshots=snapshots, snapshot_interval=interval)
     ring, rings = jnp.zeros((snapshots, 1, 1)), []
     for step in range(updates):
-        ring = follow(chosen, ring, jnp.full((1, 1), 16.0), jnp.int32(step))
+        ring = follow(numbers_of(chosen, 1), ring, jnp.full((1, 1), 16.0), jnp.int32(step))
         rings.append(ring[:, 0, 0].tolist())
     return rings
 
@@ -124,10 +125,10 @@ def test_a_ring_of_one_is_the_polyak_target_whatever_the_interval(interval):
 )
 def test_the_live_slot_goes_round_the_ring_of_three(interval, slots):
     chosen = settings(snapshots=3, snapshot_interval=interval)
-    assert [int(live_slot(chosen, jnp.int32(step))) for step in range(8)] == slots
+    assert [int(live_slot(numbers_of(chosen, 1), chosen.snapshots, jnp.int32(step))) for step in range(8)] == slots
 
 
 def test_the_polyak_rate_is_the_share_of_the_critic():
     chosen = dataclasses.replace(settings(), polyak_rate=0.25)
-    moved = follow(chosen, jnp.full((1, 2, 1), 4.0), jnp.array([[8.0], [0.0]]), jnp.int32(0))
+    moved = follow(numbers_of(chosen, 1), jnp.full((1, 2, 1), 4.0), jnp.array([[8.0], [0.0]]), jnp.int32(0))
     assert moved.tolist() == [[[5.0], [3.0]]]

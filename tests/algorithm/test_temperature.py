@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from saclab.algorithm.numbers import numbers_of
 from saclab.algorithm.temperature import TEMPERATURES
 from saclab.config import AlgorithmSettings
 
@@ -22,7 +23,7 @@ def learned(gradient: str = "log_alpha", target_entropy: float | None = None, ac
         temperature_learning_rate=RATE,
         target_entropy=target_entropy,
     )
-    return TEMPERATURES["learned"](settings, actions)
+    return TEMPERATURES["learned"](settings, numbers_of(settings, actions))
 
 
 def step(temperature, log_alpha: float, log_prob):
@@ -68,6 +69,6 @@ def test_no_gradient_flows_from_the_temperature_loss_into_the_policy():
 
 
 def test_a_fixed_temperature_stays_for_any_entropy():
-    fixed = TEMPERATURES["fixed"](AlgorithmSettings(), 2)
+    fixed = TEMPERATURES["fixed"](AlgorithmSettings(), numbers_of(AlgorithmSettings(), 2))
     log_alpha, _, loss = step(fixed, -1.5, [100.0])
     assert (float(log_alpha), float(loss)) == (-1.5, 0.0)

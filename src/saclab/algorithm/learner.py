@@ -12,6 +12,7 @@ import optax
 
 from saclab.algorithm import losses, targets
 from saclab.algorithm.networks import NETWORKS, Network
+from saclab.algorithm.numbers import Numbers, numbers_of
 from saclab.algorithm.policy import Policy, make_policy
 from saclab.algorithm.temperature import TEMPERATURES, Temperature
 from saclab.algorithm.types import Batch, LearnerState, Metrics, Optimizers, TargetState
@@ -35,6 +36,7 @@ class Parts(NamedTuple):
     """The axis values that a variant is put together from."""
 
     settings: AlgorithmSettings
+    numbers: Numbers
     action_size: int
     policy: Policy
     q_network: Network
@@ -53,18 +55,26 @@ class Parts(NamedTuple):
         return self.policy.sample(actor, observation, noise)
 
 
-def make_learner(settings: AlgorithmSettings, observation_size: int, action_size: int) -> Learner:
-    """The learner of `settings` for observations f32[observation_size] and actions f32[action_size] in [-1, 1]."""
+def make_learner(
+    settings: AlgorithmSettings, observation_size: int, action_size: int, traced: Numbers | None = None
+) -> Learner:
+    """The learner of `settings` for observations f32[observation_size] and actions f32[action_size] in [-1, 1].
+
+    Numbers that are `traced` take the place of those in `settings`: mapped over, they make a learner for each run.
+    """
+    numbers = traced or numbers_of(settings, action_size)
+    policy = make_policy(settings, observation_size, action_size)
     parts = Parts(
         settings=settings,
+        numbers=numbers,
         action_size=action_size,
-        policy=make_policy(settings, observation_size, action_size),
+        policy=policy._replace(log_std_minimum=numbers.log_std_minimum, log_std_maximum=numbers.log_std_maximum),
         q_network=NETWORKS[settings.network](
             observation_size + action_size, settings.hidden_layers, 1, settings.activation
         ),
-        temperature=TEMPERATURES[settings.temperature](settings, action_size),
-        actor_optimizer=optax.adam(settings.actor_learning_rate),
-        critic_optimizer=optax.adam(settings.critic_learning_rate),
+        temperature=TEMPERATURES["either" if traced else settings.temperature](settings, numbers),
+        actor_optimizer=optax.adam(numbers.actor_learning_rate),
+        critic_optimizer=optax.adam(numbers.critic_learning_rate),
     )
     return Learner(partial(init, parts), partial(update, parts), parts.policy, parts.q_network)
 
@@ -105,7 +115,7 @@ def update(parts: Parts, state: LearnerState, batch: Batch) -> tuple[LearnerStat
     log_alpha, temperature_moments, temperature_loss = parts.temperature.update(
         state.log_alpha, state.optimizers.temperature, log_prob
     )
-    snapshots = targets.follow(parts.settings, state.target.snapshots, critic, state.step)
+    snapshots = targets.follow(parts.numbers, state.target.snapshots, critic, state.step)
 
     next_state = LearnerState(
         actor=actor,
@@ -135,7 +145,7 @@ def update_critic(
         state.target.snapshots, side_by_side(batch.next_observation, next_action)
     )
     next_value = targets.next_value(parts.settings, state.target, next_q, alpha * next_log_prob, state.step)
-    target = losses.critic_target(batch.reward, batch.terminated, next_value.value, parts.settings.discount)
+    target = losses.critic_target(batch.reward, batch.terminated, next_value.value, parts.numbers.discount)
 
     def objective(critic: jax.Array) -> tuple[jax.Array, jax.Array]:
         q = parts.q_values(critic, side_by_side(batch.observation, batch.action))

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from saclab.algorithm.numbers import Numbers
 from saclab.algorithm.types import TargetState
 from saclab.config import AlgorithmSettings
 
@@ -59,17 +60,18 @@ def next_value(
     )
 
 
-def live_slot(settings: AlgorithmSettings, step: jax.Array) -> jax.Array:
-    """The ring's slot of the target that follows the critic, after `step` updates."""
-    return (step // settings.snapshot_interval) % settings.snapshots
+def live_slot(numbers: Numbers, snapshots: int, step: jax.Array) -> jax.Array:
+    """The slot, in a ring of `snapshots`, of the target that follows the critic after `step` updates."""
+    slot: jax.Array = (step // numbers.snapshot_interval) % snapshots
+    return slot
 
 
-def follow(settings: AlgorithmSettings, snapshots: jax.Array, critic: jax.Array, step: jax.Array) -> jax.Array:
+def follow(numbers: Numbers, snapshots: jax.Array, critic: jax.Array, step: jax.Array) -> jax.Array:
     """Eq. 2 on the live target: θ̄ ← (1 − τ) θ̄ + τ θ.
 
     The result becomes the live target after step + 1 updates. Every `snapshot_interval` updates that is a new
     slot, and the value before stays behind as a snapshot; otherwise it takes the place of the value before.
     """
-    live = jnp.take(snapshots, live_slot(settings, step), axis=0)
-    moved = (1 - settings.polyak_rate) * live + settings.polyak_rate * critic
-    return snapshots.at[live_slot(settings, step + 1)].set(moved)
+    live = jnp.take(snapshots, live_slot(numbers, len(snapshots), step), axis=0)
+    moved = (1 - numbers.polyak_rate) * live + numbers.polyak_rate * critic
+    return snapshots.at[live_slot(numbers, len(snapshots), step + 1)].set(moved)

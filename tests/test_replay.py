@@ -123,7 +123,7 @@ def test_a_buffer_that_does_not_fit_is_refused_with_its_size_and_one_that_does(m
 def test_several_runs_at_once_need_several_buffers(monkeypatch):
     monkeypatch.setattr(replay, "available_memory", lambda: 2**30)
     layout = RowLayout(376, 17)
-    with pytest.raises(SettingError, match=r"in each of 3 runs at once.*or fewer --workers"):
+    with pytest.raises(SettingError, match=r"in each of 3 runs at once.*or a smaller --workers"):
         require_memory(200_000, layout, runs_at_once=3)
     require_memory(200_000, layout)
 

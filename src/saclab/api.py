@@ -223,7 +223,7 @@ def require_startable(cells: Sequence[Cell], at_once: int) -> None:
     """Raise UserError before anything is started if an environment, a folder or the memory will not do."""
     from saclab.environments.make import environment_spec, make_environment
     from saclab.replay import RowLayout, require_memory
-    from saclab.training.loop import require_same_config
+    from saclab.training.journal import require_same_config
 
     checked = set()
     for cell in cells:

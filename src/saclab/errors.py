@@ -26,13 +26,19 @@ class TrainingFailed(RuntimeError):  # noqa: N818 - it names what happened
     """A run cannot go on; what it had saved is kept. The command line exits with status 1."""
 
 
-class NonFiniteError(TrainingFailed):
-    """An environment or an update gave a number that is not finite."""
+class RunBroken(TrainingFailed):
+    """Something in a run itself, its environment or an update, ends it; in a batch the other runs go on."""
 
-    def __init__(self, message: str, arrays: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, message: str, arrays: Mapping[str, Any] | None = None, traceback: str = "") -> None:
         super().__init__(message)
         self.arrays = dict(arrays or {})
         """Name -> NumPy array: what is left for a look at the step."""
+        self.traceback = traceback
+        """Where an environment's code raised an error, if it did."""
+
+
+class NonFiniteError(RunBroken):
+    """An environment or an update gave a number that is not finite."""
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:

@@ -15,9 +15,10 @@ import safetensors.numpy
 from environments import tiny  # noqa: F401 - registers them
 
 from saclab import replay
+from saclab.algorithm.types import Metrics
 from saclab.errors import NonFiniteError, SettingError, TrainingFailed
 from saclab.protocols import make_config
-from saclab.training import checkpoint, loop
+from saclab.training import checkpoint, journal, loop
 from saclab.training.checkpoint import newest_first, read_manifest
 from saclab.training.events import Warned
 from saclab.training.requests import Requests
@@ -69,7 +70,7 @@ def test_an_update_that_breaks_is_named_and_the_environment_is_not_blamed(tmp_pa
         def breaking(state, rows):
             state, metrics = update(state, rows)
             if run.counters.updates == 9:
-                metrics = metrics.at[loop.Metrics._fields.index(field)].set(jnp.nan)
+                metrics = metrics.at[Metrics._fields.index(field)].set(jnp.nan)
                 state = state._replace(actor=state.actor * jnp.nan)
             return state, metrics
 
@@ -104,13 +105,13 @@ def test_a_fixed_temperature_of_zero_has_a_logarithm_that_is_saved():
     [
         ((1e-5, 0.9), ["cannot reach the target entropy: lower --target-entropy"]),
         ((1.1, 100.0), ["raise --target-entropy"]),
-        (loop.SANE_TEMPERATURES, []),
+        (journal.SANE_TEMPERATURES, []),
     ],
     ids=["exploding", "collapsing", "sane"],
 )
 def test_a_runaway_temperature_is_told_once_with_advice(tmp_path, monkeypatch, sane, advice):
     """The temperature begins at 1 and stays near it for so few updates."""
-    monkeypatch.setattr(loop, "SANE_TEMPERATURES", sane)
+    monkeypatch.setattr(journal, "SANE_TEMPERATURES", sane)
     config = small_config("Pendulum-v1", max_steps=110, evaluation_interval_steps=1_000)
     told = [event.message for event in loop.train(config, tmp_path) if isinstance(event, Warned)]
     assert len(told) == len(advice)
@@ -120,11 +121,11 @@ def test_a_runaway_temperature_is_told_once_with_advice(tmp_path, monkeypatch, s
 @pytest.mark.parametrize("temperature", [1e-9, 1.0, 1e9])
 def test_a_fixed_temperature_is_no_news(temperature):
     session = SimpleNamespace(warned_of_temperature=False, run=SimpleNamespace(config=small_config("Any-v0", "sac")))
-    assert list(loop.Session._watch_temperature(session, temperature)) == []
+    assert list(journal.Journal._watch_temperature(session, temperature)) == []
 
 
 def test_the_bounds_of_a_sane_temperature():
-    assert loop.SANE_TEMPERATURES == (1e-5, 100.0)
+    assert journal.SANE_TEMPERATURES == (1e-5, 100.0)
 
 
 # --- memory
@@ -184,8 +185,8 @@ def test_a_disk_that_fills_up_while_logs_are_written_is_told(tmp_path, monkeypat
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(loop.Logs, "metrics", full)
-    monkeypatch.setattr(loop.Logs, "close", full)
+    monkeypatch.setattr(journal.Logs, "metrics", full)
+    monkeypatch.setattr(journal.Logs, "close", full)
     with pytest.raises(TrainingFailed, match=r"No space left on device; what was saved is kept: make room.*resume"):
         list(loop.train(config, tmp_path))
     assert newest_first(tmp_path / "checkpoints") == kept
@@ -201,7 +202,7 @@ def test_a_full_disk_does_not_hide_the_number_that_broke_the_run(tmp_path, monke
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(loop, "write_failure", full)
+    monkeypatch.setattr(journal, "write_failure", full)
     arguments = {"broken_at": 3, "broken": "reward"}
     config = make_config("Counting-v0", "sac", environment_arguments=arguments, overrides={
         "hidden_layers": (8,), "batch_size": 4, "random_steps": 12, "max_steps": 60, "evaluation_interval_steps": 100,

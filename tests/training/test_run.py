@@ -16,7 +16,8 @@ from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError
 from saclab.protocols import PROTOCOLS, make_config, training_settings
 from saclab.training import seeds
-from saclab.training.run import Counters, Run
+from saclab.training.course import Counters
+from saclab.training.run import Run
 
 TINY = {
     "hidden_layers": (8,),

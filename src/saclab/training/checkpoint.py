@@ -20,7 +20,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +40,7 @@ SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
 CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(-untested)?")
 MANIFEST_BYTES = 2**26  # far more than the plain state of a thousand environments
 LARGEST_COUNT = 2**53
+LARGEST_BATCH = 4096
 
 Arrays = dict[str, np.ndarray]
 
@@ -95,7 +97,8 @@ def cannot_save(final: Path, error: OSError) -> str:
     return (
         f"cannot save {final}: {reason}. "
         + (f"The last good checkpoint, {kept[0].name}, is kept" if kept else "There is no earlier checkpoint")
-        + f"; make room, then continue with: saclab resume {final.parent.parent}"
+        + "; make room, then start the same command again, or continue a run that is alone with: saclab resume "
+        + str(final.parent.parent)
     )
 
 
@@ -116,8 +119,7 @@ def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[s
             problems.append(f"{path} is damaged: {error}")
             continue
         for bad, problem in zip(damaged, problems, strict=True):
-            shutil.rmtree(bad.with_suffix(".damaged"), ignore_errors=True)
-            bad.rename(bad.with_suffix(".damaged"))
+            set_aside(bad, ".damaged")
             warn(f"{problem}; it is set aside, and {path.name} before it is used")
         return checkpoint
     if problems:
@@ -125,11 +127,84 @@ def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[s
     return None
 
 
+def common_checkpoints(
+    runs: Sequence[Path], replay: ReplayBuffer, warns: Sequence[Callable[[str], None]]
+) -> list[Path]:
+    """The checkpoints of the newest step of which every run folder has a whole one; an empty list if none has any.
+
+    Each is read once to see that it is whole, its transitions into `replay`.
+
+    Newer ones are taken away: they are damaged, or the others were not saved before the process was killed.
+
+    Raises:
+        CheckpointError: if there is no such step; the checkpoints stay as they are then.
+    """
+    found = [{step_of(path): path for path in reversed(newest_first(run / "checkpoints"))} for run in runs]
+    if not any(found):
+        return []
+    damaged: dict[Path, str] = {}
+    for step in sorted(set.intersection(*(set(paths) for paths in found)), reverse=True):
+        checkpoints = [paths[step] for paths in found]
+        for path in checkpoints:
+            try:
+                read_checkpoint(path, replay)
+            except (CheckpointError, OSError) as error:
+                damaged[path] = f"{path} is damaged: {error}"
+        if damaged.keys() & set(checkpoints):
+            continue
+        for paths, warn in zip(found, warns, strict=True):
+            for newer in (paths[other] for other in paths if other > step):
+                set_aside(newer, ".damaged" if newer in damaged else ".partial")
+                if newer in damaged:
+                    warn(f"{damaged[newer]}; it is set aside, and {paths[step].name} before it is used")
+        return checkpoints
+    problems = list(damaged.values()) + [
+        f"{run} has {', '.join(path.name for path in paths.values()) or 'none'}"
+        for run, paths in zip(runs, found, strict=True)
+    ]
+    raise CheckpointError(
+        f"the runs of the batch have no whole checkpoint of the same step: {'; '.join(problems)}. Continue them each "
+        "alone (--batch 0), or in batches of those that are equally far"
+    )
+
+
+def set_aside(checkpoint: Path, suffix: str) -> None:
+    """From now on it is none."""
+    shutil.rmtree(checkpoint.with_suffix(suffix), ignore_errors=True)
+    checkpoint.rename(checkpoint.with_suffix(suffix))
+
+
+def step_of(checkpoint: Path) -> int:
+    return int(checkpoint.name.split("-")[1])
+
+
 def newest_first(folder: Path) -> list[Path]:
     """The finished checkpoints."""
     found = [(match, path) for path in folder.glob("step-*") if (match := CHECKPOINT_NAME.fullmatch(path.name))]
     found.sort(key=lambda pair: (int(pair[0][1]), pair[0][2] is None), reverse=True)
     return [path for _, path in found]
+
+
+def checkpoint_steps(run: Path) -> list[int]:
+    """The steps of a run folder's finished checkpoints, newest first."""
+    return [step_of(path) for path in newest_first(run / "checkpoints")]
+
+
+def batch_slots(run: Path) -> int:
+    """Slots of the batch in which a run was saved last, or begun; 0 if it was not begun, or is alone."""
+    for path in newest_first(run / "checkpoints"):
+        with suppress(CheckpointError, OSError):
+            return slots_among(read_manifest(path)["state"].get("facts"))
+    with suppress(OSError, ValueError, RecursionError):
+        return slots_among(json.loads((run / "config.json").read_text()))
+    return 0
+
+
+def slots_among(facts: object) -> int:
+    """The slots in what `machine_facts` gave, if that is what it is."""
+    machine = facts.get("machine") if isinstance(facts, dict) else None
+    slots = machine.get("batch") if isinstance(machine, dict) else None
+    return slots if type(slots) is int and 0 <= slots <= LARGEST_BATCH else 0
 
 
 def replaced_by_next(folder: Path) -> Path | None:
@@ -174,7 +249,7 @@ def write_replay(folder: Path, replay: ReplayBuffer, link_from: Path | None) -> 
         if link_from and entry.get("version") == version and linked(link_from / name, folder / name, entry["bytes"]):
             files[name] = entry
         else:
-            files[name] = write_arrays(folder / name, {"rows": rows}) | {"version": version}
+            files[name] = write_arrays(folder / name, {"rows": replay.rows[rows]}) | {"version": version}
     return files
 
 
@@ -197,9 +272,10 @@ def linked(source: Path, destination: Path, size: int) -> bool:
     return True
 
 
-def segments(replay: ReplayBuffer) -> Iterator[np.ndarray]:
+def segments(replay: ReplayBuffer) -> Iterator[slice]:
+    """The rows of each segment; to look at them may mean to fetch them from a device."""
     for start in range(0, replay.size, SEGMENT_ROWS):
-        yield replay.rows[start : min(start + SEGMENT_ROWS, replay.size)]
+        yield slice(start, min(start + SEGMENT_ROWS, replay.size))
 
 
 def segment_version(index: int, replay: ReplayBuffer) -> int:

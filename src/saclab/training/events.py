@@ -75,10 +75,16 @@ class Finished(NamedTuple):
     final_return: float
 
 
+class Failed(NamedTuple):
+    """A run of a batch met a number that is not finite, or its environment broke; the others go on."""
+
+    message: str
+
+
 class Interrupted(NamedTuple):
     """Stopped on request; the run can be resumed from its checkpoint."""
 
     steps: int
 
 
-Event = Started | Progress | EpisodeEnded | UpdatesLogged | Evaluated | Warned | Saved | Finished | Interrupted
+Event = Started | Progress | EpisodeEnded | UpdatesLogged | Evaluated | Warned | Saved | Finished | Failed | Interrupted

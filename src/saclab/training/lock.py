@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from saclab.errors import UserError
+
+RETRY_SECONDS = 0.5
 
 
 @contextmanager
@@ -31,3 +34,12 @@ def locked(folder: Path) -> Iterator[None]:
         file.write(str(os.getpid()))
         file.flush()
         yield
+
+
+def wait_until_free(folder: Path, seconds: float) -> None:
+    """Wait for another process to let go of the run folder, at most so long."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        with suppress(UserError), locked(folder):
+            return
+        time.sleep(RETRY_SECONDS)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
-from importlib.metadata import version
+import subprocess
+import sys
+from importlib.metadata import entry_points, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +16,17 @@ HOW_TO_MATCH = {
     "threads": "continue exactly with --threads {0} (or NPROC={0} in the environment)",
     "numpy_threads": "continue exactly with OPENBLAS_NUM_THREADS={0} in the environment (--threads sets it too)",
     "xla_flags": "continue exactly with XLA_FLAGS={0!r} in the environment",
+    "batch": "continue exactly in a batch of {0} (0: alone; see --batch)",
 }
 
 
-def machine_facts() -> dict[str, Any]:
-    """The versions and the machine of this process."""
+def machine_facts(device: str = "", batch: int = 0) -> dict[str, Any]:
+    """The versions and the machine of this process.
+
+    Args:
+        device: what XLA computes on; empty where nothing is computed.
+        batch: slots of the batch that a run is trained in; 0 if it is alone.
+    """
     return {
         "versions": {package: version(package) for package in PACKAGES} | {"python": platform.python_version()},
         "machine": {
@@ -26,6 +35,8 @@ def machine_facts() -> dict[str, Any]:
             "threads": visible_threads("NPROC"),
             "numpy_threads": visible_threads("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"),
             "xla_flags": os.environ.get("XLA_FLAGS", ""),
+            "device": device,
+            "batch": batch,
         },
     }
 
@@ -41,6 +52,20 @@ def visible_threads(*variables: str) -> int:
 def usable_cores() -> list[int]:
     """The cores that this process may use, by their numbers."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def accelerator_plugins() -> bool:
+    """Whether JAX has been installed for more than the CPU; whether there is such a device is another question."""
+    return bool(entry_points(group="jax_plugins")) or find_spec("libtpu") is not None
+
+
+def accelerator() -> bool:
+    """Whether JAX finds an accelerator, asked in another process: this one may not want to take its memory."""
+    if not accelerator_plugins():
+        return False
+    ask = [sys.executable, "-c", "import jax; print(jax.default_backend())"]
+    answer = subprocess.run(ask, capture_output=True, text=True)
+    return answer.returncode == 0 and answer.stdout.strip() not in ("", "cpu")
 
 
 def processor_name() -> str:
@@ -60,10 +85,10 @@ def processor_entry(name: str) -> str:
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
 
 
-def different_facts(saved: object) -> list[str]:
-    """Warnings for each version or machine fact that is not what a checkpoint was made with."""
+def different_facts(saved: object, current: dict[str, Any]) -> list[str]:
+    """Warnings for each version or machine fact that is not `current` but what a checkpoint was made with."""
     warnings = []
-    for part, now in machine_facts().items():
+    for part, now in current.items():
         then = saved.get(part) if isinstance(saved, dict) else None
         for name, value in now.items():
             before = then.get(name) if isinstance(then, dict) else None

@@ -13,17 +13,24 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version as jaxlib_version
 
-from saclab.training.machine import processor_features, visible_threads
+from saclab.training.machine import accelerator_plugins, processor_features, visible_threads
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 KEPT_BYTES = 2**28  # larger blocks, such as most replay buffers, still come from the system and go back to it
 WORTH_KEEPING_SECONDS = 0.1
 
 
+def device_name() -> str:
+    """What XLA computes on, such as `cpu` or `2 × NVIDIA H200`."""
+    devices = jax.devices()
+    return f"{len(devices)} × {devices[0].device_kind}" if len(devices) > 1 else str(devices[0].device_kind)
+
+
 @lru_cache(maxsize=1)
 def prepare_process() -> None:
     """Set this process up, once; the results of a run do not depend on it."""
     keep_freed_memory()
+    use_deterministic_kernels()
     use_compilation_cache()
 
 
@@ -37,6 +44,13 @@ def keep_freed_memory() -> None:
         mallopt(M_MMAP_THRESHOLD, KEPT_BYTES)
         mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
         mallopt(M_ARENA_MAX, 1)  # the others give a part back as soon as all of it is free
+
+
+def use_deterministic_kernels() -> None:
+    """On a GPU, hold XLA to kernels that give the same bits every time, unless XLA_FLAGS says something of it."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if accelerator_plugins() and "xla_gpu_deterministic_ops" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
 
 
 def use_compilation_cache() -> None:

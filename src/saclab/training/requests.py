@@ -11,3 +11,7 @@ class Requests:
     """Save and stop; the number of the signal that asked for it, or any other number but 0."""
     save: bool = False
     """Save and go on."""
+
+
+class Stopped(Exception):  # noqa: N818 - no error
+    """Asked to stop in the middle of a test, whose episodes so far count for nothing."""

@@ -7,6 +7,7 @@ evaluations.csv      one line per evaluation, with every episode's return
 checkpoints/         what `saclab resume` continues from
 best/                the policy with the best test return
 result.json          written when the run has finished
+failure/             what led to its end, if it came to a bad one
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from saclab.config import Config
 from saclab.errors import UserError
 
 FORMAT = 1
+FAILURE = "failure"
+"""Folder with what led to a run's end, if it came to a bad one."""
 LOGS = ("metrics.jsonl", "episodes.csv", "evaluations.csv", "q_bias.csv")
 EPISODE_COLUMNS = ("episode", "steps", "updates", "return", "running_average", "length", "terminated", "seconds")
 """`episode` counts from 1 after the random steps; episodes that ended within them have number 0."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import gymnasium
@@ -84,6 +85,42 @@ class Constant(gymnasium.Env):
         return np.ones(1, np.float32), 2.0, self.terminal, False, {}
 
 
+class Fragile(Constant):
+    """At step `broken_at` of an episode, some go wrong in the way that `how` says: those that drew a number below ½.
+
+    Args:
+        how: "nan" for a reward that is not a number, "raise" for an error, "exit" for the end of the process.
+        broken_at: counted over all episodes.
+    """
+
+    def __init__(self, how: str = "nan", broken_at: int = 100, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.how, self.broken_at, self.count, self.doomed = how, broken_at, 0, False
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        observation, information = super().reset(seed=seed)
+        if seed is not None:
+            self.doomed = self.np_random.uniform() < 0.5
+        return observation, information
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        observation, reward, *rest = super().step(action)
+        self.count += 1
+        if self.doomed and self.count == self.broken_at:
+            if self.how == "raise":
+                raise RuntimeError("the wheels came off")
+            if self.how == "exit":
+                sys.exit("the process came off")
+            reward = np.nan
+        return observation, reward, *rest
+
+    def saclab_capture(self) -> dict[str, np.ndarray]:
+        return {"counters": np.array([self.count, self.doomed])}
+
+    def saclab_restore(self, state: dict[str, np.ndarray]) -> None:
+        self.count, self.doomed = int(state["counters"][0]), bool(state["counters"][1])
+
+
 class Odd(gymnasium.Env):
     """Of the spaces that saclab refuses."""
 
@@ -104,4 +141,5 @@ class Odd(gymnasium.Env):
 gymnasium.register("Counting-v0", Counting, max_episode_steps=TIME_LIMIT)
 gymnasium.register("CapturableCounting-v0", CapturableCounting, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Constant-v0", Constant, max_episode_steps=TIME_LIMIT)
+gymnasium.register("Fragile-v0", Fragile, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Odd-v0", Odd)

@@ -1,0 +1,273 @@
+"""The processes that step the environments of a batch, from the batch's side."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+
+from saclab.batch import frames
+from saclab.batch.board import Board, Sizes
+from saclab.batch.worker import DONE, MESSAGE, STEP
+from saclab.config import Config
+from saclab.environments.make import EnvironmentSpec
+from saclab.environments.vector import EndedEpisode
+from saclab.errors import NonFiniteError, RunBroken, TrainingFailed, UserError
+from saclab.training import seeds
+from saclab.training.captured import join_arrays, split_arrays
+from saclab.training.checkpoint import CheckpointError
+from saclab.training.requests import Stopped
+
+POLL_SECONDS = 0.1
+Arrays = dict[str, np.ndarray]
+Job = tuple[dict[str, Any], Arrays]
+
+
+class EnvironmentWorkerDied(TrainingFailed):
+    """A process that steps environments ended by itself."""
+
+
+class EnvironmentPool:
+    """Environments of all runs, spread evenly over processes; each run's seeds are those that it has alone."""
+
+    def __init__(self, configs: Sequence[Config], spec: EnvironmentSpec, workers: int) -> None:
+        """Start the processes and their environments' first episodes.
+
+        Raises:
+            UserError: if an environment cannot be made.
+        """
+        self.environments = configs[0].training.parallel_environments
+        self.spec = spec
+        self.board = Board(Sizes(len(configs), self.environments, spec.observation_size, spec.action_size))
+        self.board.active[:] = True
+        self.workers: list[PoolWorker] = []
+        try:
+            parts = [part for part in np.array_split(np.arange(len(self.board.row)), workers) if len(part)]
+            for part in parts:  # all of them start before the first is waited for
+                self.workers.append(PoolWorker(self.board, part // self.environments))
+            for worker, part in zip(self.workers, parts, strict=True):
+                worker.make_environments(configs, int(part[0]), self.board)
+            for worker in self.workers:
+                reply, _ = worker.receive()
+                if "user_error" in reply:
+                    raise UserError(reply["user_error"])
+        except BaseException:
+            self.close()
+            raise
+
+    def step(self, action: np.ndarray) -> dict[int, RunBroken]:
+        """Apply f32[N, A] in [-1, 1] in every active run; run -> what ended it.
+
+        The transitions, observations and ended episodes are on the board then.
+
+        Raises:
+            EnvironmentWorkerDied: if a process is gone.
+        """
+        self.board.action[:] = action
+        for worker in self.workers:
+            worker.command(STEP)
+        failures: dict[int, RunBroken] = {}
+        for worker in self.workers:
+            failures |= worker.step_failures()
+        return failures
+
+    def ended(self, run: int) -> list[EndedEpisode]:
+        """The episodes of a run that ended in the last step."""
+        board, first = self.board, run * self.environments
+        return [
+            EndedEpisode(index, float(board.total_reward[place]), int(board.length[place]),
+                         bool(board.terminated[place]))
+            for index, place in enumerate(range(first, first + self.environments)) if board.ended[place]
+        ]  # fmt: skip
+
+    def leave(self, run: int) -> None:
+        """Step a run no more."""
+        self.board.active[run] = False
+        self.board.ended[self._places(run)] = False
+
+    def observation(self, run: int) -> np.ndarray:
+        """f32[E, O]."""
+        current: np.ndarray = self.board.observation[self._places(run)].copy()
+        return current
+
+    def work_off(self, jobs: Sequence[Job], asked_to_stop: Callable[[], bool]) -> list[Job]:
+        """The workers' replies to these messages, each of which goes to whoever is free.
+
+        Raises:
+            Stopped: when `asked_to_stop`; what the jobs have done so far counts for nothing.
+            EnvironmentWorkerDied: if a process is gone.
+        """
+        replies: dict[int, Job] = {}
+        waiting = list(enumerate(jobs))
+        busy: dict[PoolWorker, int] = {}
+        self.board.stop[0] = False
+        with selectors.DefaultSelector() as selector:
+            for worker in self.workers:
+                selector.register(worker.answers, selectors.EVENT_READ, worker)
+            while waiting or busy:
+                for worker in self.workers:
+                    if waiting and worker not in busy:
+                        busy[worker], (header, arrays) = waiting.pop(0)
+                        worker.send(header, arrays)
+                for key, _ in selector.select(POLL_SECONDS):
+                    replies[busy.pop(key.data)] = key.data.receive()
+                if asked_to_stop():
+                    self.board.stop[0] = True
+                    waiting = []
+        if self.board.stop[0] or any("stopped" in header for header, _ in replies.values()):
+            raise Stopped
+        return [replies[index] for index in range(len(jobs))]
+
+    def capture(self, run: int) -> list[dict[str, Any] | None]:
+        """As `TrainingEnvironments.capture`."""
+        states: list[dict[str, Any] | None] = []
+        for worker in self._owners(run):
+            worker.send({"do": "capture", "run": run}, {})
+            reply, arrays = worker.receive()
+            states += join_arrays(arrays, reply["rest"], self._example(len(reply["rest"])))
+        return states
+
+    def restore(self, run: int, states: list[dict[str, Any] | None], new_seeds: list[int]) -> list[int]:
+        """As `TrainingEnvironments.restore`; raises CheckpointError for states that do not fit."""
+        restarted: list[int] = []
+        first = 0
+        for worker in self._owners(run):
+            part = slice(first, first + worker.count(run))
+            arrays, rest = split_arrays(states[part])
+            worker.send({"do": "restore", "run": run, "rest": rest, "seeds": new_seeds[part]}, arrays)
+            reply, _ = worker.receive()
+            if "misfit" in reply:
+                raise CheckpointError(reply["misfit"])
+            restarted += [first + index for index in reply["restarted"]]
+            first = part.stop
+        return restarted
+
+    def close(self) -> None:
+        """End the processes."""
+        for worker in self.workers:
+            worker.close()
+        self.board.close()
+
+    def _owners(self, run: int) -> list[PoolWorker]:
+        return [worker for worker in self.workers if worker.count(run)]
+
+    def _places(self, run: int) -> slice:
+        return slice(run * self.environments, (run + 1) * self.environments)
+
+    def _example(self, environments: int) -> np.ndarray:
+        return np.zeros((environments, self.spec.observation_size), np.float32)
+
+
+class PoolWorker:
+    """One of the processes, with the pipes to it."""
+
+    def __init__(self, board: Board, runs: np.ndarray) -> None:
+        """Start it.
+
+        Args:
+            board: the shared memory.
+            runs: i64[n], ascending: the run of each of its environments.
+        """
+        self.runs = runs
+        self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - open as long as the process
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "saclab.batch.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self.errors,
+            env=os.environ | {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+            pass_fds=[board.file_descriptor],
+            start_new_session=True,
+        )
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.commands, self.answers = self.process.stdin.fileno(), self.process.stdout.fileno()
+
+    def make_environments(self, configs: Sequence[Config], first: int, board: Board) -> None:
+        """Tell it what to make, from place `first` of the board on; its first answer says whether that was possible."""
+        environments = configs[0].training.parallel_environments
+        shares: list[dict[str, Any]] = []
+        for run in dict.fromkeys(self.runs.tolist()):
+            all_seeds = seeds.integers(configs[run].seed, "environments", environments)
+            start = first - run * environments if not shares else 0
+            own_seeds = all_seeds[start : start + self.count(run)]
+            shares.append({"run": run, "first": run * environments + start, "seeds": own_seeds})
+        task = {
+            "sizes": board.sizes._asdict(),
+            "board": board.file_descriptor,
+            "configs": {run: config.to_dict() for run, config in enumerate(configs)},
+            "shares": shares,
+        }
+        with self.alive():
+            frames.send(self.commands, task)
+
+    def count(self, run: int) -> int:
+        """Environments of a run that it steps."""
+        return int((self.runs == run).sum())
+
+    def command(self, byte: bytes) -> None:
+        with self.alive():
+            os.write(self.commands, byte)
+
+    def send(self, header: dict[str, Any], arrays: Arrays) -> None:
+        self.command(MESSAGE)
+        with self.alive():
+            frames.send(self.commands, header, arrays)
+
+    def receive(self) -> Job:
+        with self.alive():
+            return frames.receive(self.answers)
+
+    def step_failures(self) -> dict[int, RunBroken]:
+        """Wait for its step; run -> what ended it."""
+        with self.alive():
+            if (answer := os.read(self.answers, 1)) == DONE:
+                return {}
+            if not answer:
+                raise EOFError
+        failures, arrays = self.receive()
+        return {
+            int(run): error_of(entry, {name: arrays[name] for name in arrays if name.startswith(f"{run}.")})
+            for run, entry in failures.items()
+        }
+
+    @contextmanager
+    def alive(self) -> Iterator[None]:
+        """Turn a broken pipe into what is known of the process's end."""
+        try:
+            yield
+        except (EOFError, BrokenPipeError) as error:
+            code = self.process.wait()
+            how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+            self.errors.seek(0)
+            last_words = [line for line in self.errors.read().splitlines() if line.strip()][-1:]
+            raise EnvironmentWorkerDied(
+                f"the process that steps the environments of runs {sorted(set(self.runs.tolist()))} of the batch ended "
+                f"with {how}" + "".join(f": {line}" for line in last_words) + ". Nothing that was saved is lost: start "
+                "the same command again to continue the batch from its last checkpoint"
+            ) from error
+
+    def close(self) -> None:
+        with suppress(OSError):
+            assert self.process.stdin is not None
+            self.process.stdin.close()
+        self.process.terminate()
+        self.process.wait()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self.errors.close()
+
+
+def error_of(entry: dict[str, str], arrays: Arrays) -> RunBroken:
+    """The error that a worker has described."""
+    if "not_finite" in entry:
+        return NonFiniteError(entry["not_finite"], {name.partition(".")[2]: array for name, array in arrays.items()})
+    return RunBroken(f"the environment raised {entry['error']}", arrays, entry["traceback"])

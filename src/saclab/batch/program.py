@@ -1,0 +1,156 @@
+"""What a batch computes on its devices: S slots side by side, each with a learner and a replay buffer of its own.
+
+Two compiled functions. `act` chooses the next actions of all runs; `advance` stores their new transitions, draws the
+minibatches and makes the updates. They are two because what one call gives is ready only when all of it is: the
+actions would otherwise wait for the updates, and the physics for the actions.
+
+Whatever the host knows of a step arrives as one array, and the actions leave as one array. Slots are spread over all
+devices; as runs have nothing to do with each other, no device ever waits for another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from saclab.algorithm.learner import make_learner
+from saclab.algorithm.numbers import Numbers
+from saclab.algorithm.types import LearnerState
+from saclab.config import AlgorithmSettings
+from saclab.replay import RowLayout
+
+RUNS: Any = PartitionSpec("runs")  # type: ignore[no-untyped-call]
+UNROLLED_UPDATES = 4  # of one call; more are a loop, which compiles sooner
+
+
+class Arrival(NamedTuple):
+    """How what arrives for a step lies in one array i32[S, width]; floating-point numbers are there as their bits."""
+
+    layout: RowLayout
+    environments: int
+    """E, of each run."""
+    updates: int
+    """U, made after this step."""
+    batch_size: int
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of each part, for one slot."""
+        return {
+            "observation": (self.environments, self.layout.observation_size),
+            "noise": (self.environments, self.layout.action_size),
+            "rows": (self.environments, self.layout.width),
+            "position": (),
+            "drawn": (self.updates, self.batch_size),
+        }
+
+    def places(self) -> dict[str, slice]:
+        sizes = [int(np.prod(shape)) for shape in self.shapes.values()]
+        ends = pairwise([0, *accumulate(sizes)])
+        return {name: slice(*end) for name, end in zip(self.shapes, ends, strict=True)}
+
+    def pack(self, slots: int, **parts: np.ndarray) -> np.ndarray:
+        """A new array, zero where nothing is given; each part has a leading axis of at most S."""
+        places = self.places()
+        packed = np.zeros((slots, places["drawn"].stop), np.int32)
+        for name, part in parts.items():
+            target = packed.view(part.dtype)[: len(part), places[name]]
+            target[:] = part.reshape(len(part), -1)
+        return packed
+
+    def unpack(self, packed: jax.Array, name: str) -> jax.Array:
+        """One part, of one slot's i32[width]."""
+        part = packed[self.places()[name]].reshape(self.shapes[name])
+        return part if name in ("position", "drawn") else jax.lax.bitcast_convert_type(part, jnp.float32)
+
+
+class Program:
+    """The two functions for one structure of runs."""
+
+    def __init__(self, settings: AlgorithmSettings, layout: RowLayout, environments: int, slots: int) -> None:
+        """For at least `slots` slots: as many as can be spread evenly over the devices.
+
+        Args:
+            settings: of any run of the batch; its plain numbers play no part.
+            layout: of the transitions.
+            environments: of each run.
+            slots: how many runs there may be.
+        """
+        self.settings, self.layout, self.environments = settings, layout, environments
+        devices = jax.devices()
+        self.slots = -(-slots // len(devices)) * len(devices)
+        self.mesh = Mesh(np.array(devices), ("runs",))
+        self.act = self._mapped(self._act, donated=())
+        self._advance: dict[int, Callable[..., Any]] = {}
+
+    @cached_property
+    def sharding(self) -> NamedSharding:
+        return NamedSharding(self.mesh, RUNS)
+
+    def put(self, tree: Any) -> Any:
+        """Host arrays [S, …] on the devices."""
+        return jax.device_put(tree, self.sharding)
+
+    def arrival(self, updates: int) -> Arrival:
+        return Arrival(self.layout, self.environments, updates, self.settings.batch_size)
+
+    def advance(
+        self, updates: int, numbers: Numbers, state: LearnerState, replay: jax.Array, packed: jax.Array
+    ) -> tuple[LearnerState, jax.Array, jax.Array]:
+        """Store transitions and make `updates` updates: the learners, replay, and metrics f32[S, U, M].
+
+        `replay` f32[S, capacity, width] is used up, and so is the state, but for the actor: it may act for longer.
+        """
+        if updates not in self._advance:
+
+            def advance(
+                numbers: Numbers, actor: jax.Array, others: dict[str, Any], replay: jax.Array, packed: jax.Array
+            ) -> Any:
+                return self._advance_slot(updates, numbers, LearnerState(actor=actor, **others), replay, packed)
+
+            self._advance[updates] = self._mapped(advance, donated=(2, 3))
+        others = state._asdict()
+        actor = others.pop("actor")
+        result: tuple[LearnerState, jax.Array, jax.Array] = self._advance[updates](
+            numbers, actor, others, replay, packed
+        )
+        return result
+
+    def _act(self, numbers: Numbers, actor: jax.Array, packed: jax.Array) -> jax.Array:
+        """Actions f32[E, A] of one slot."""
+        arrival = self.arrival(0)
+        policy = self._learner(numbers).policy
+        action: jax.Array = policy.act(actor, arrival.unpack(packed, "observation"), arrival.unpack(packed, "noise"))
+        return action
+
+    def _advance_slot(
+        self, updates: int, numbers: Numbers, state: LearnerState, replay: jax.Array, packed: jax.Array
+    ) -> tuple[LearnerState, jax.Array, jax.Array]:
+        arrival = self.arrival(updates)
+        positions = (arrival.unpack(packed, "position") + jnp.arange(self.environments)) % len(replay)
+        replay = replay.at[positions].set(arrival.unpack(packed, "rows"))
+        learner = self._learner(numbers)
+
+        def update(state: LearnerState, drawn: jax.Array) -> tuple[LearnerState, jax.Array]:
+            state, metrics = learner.update(state, self.layout.unpack(replay[drawn]))
+            return state, jnp.stack(metrics)
+
+        drawn = arrival.unpack(packed, "drawn")
+        unrolled = updates if 0 < updates <= UNROLLED_UPDATES else 1
+        state, metrics = jax.lax.scan(update, state, drawn, unroll=unrolled)
+        return state, replay, metrics
+
+    def _learner(self, numbers: Numbers) -> Any:
+        return make_learner(self.settings, self.layout.observation_size, self.layout.action_size, numbers)
+
+    def _mapped(self, function: Callable[..., Any], donated: tuple[int, ...]) -> Callable[..., Any]:
+        """Map over the slots, each device over its own."""
+        over_devices = jax.shard_map(jax.vmap(function), mesh=self.mesh, in_specs=RUNS, out_specs=RUNS, check_vma=False)
+        return jax.jit(over_devices, donate_argnums=donated)

@@ -1,0 +1,186 @@
+"""A process that steps some environments of a batch and plays test episodes; it makes no call into JAX.
+
+It gets its task as a message on standard input, then single bytes (STEP) and messages (MESSAGE before each), and
+answers each on what was its standard output. It ends when its input does.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saclab.algorithm.learner import make_learner
+from saclab.batch.board import Board, Sizes
+from saclab.batch.frames import receive, send
+from saclab.config import Config
+from saclab.environments.vector import TrainingEnvironments
+from saclab.errors import NonFiniteError, UserError
+from saclab.replay import RowLayout
+from saclab.training import seeds
+from saclab.training.captured import join_arrays, split_arrays
+from saclab.training.evaluation import Evaluator
+from saclab.training.q_bias import Critics, measure_q_bias
+from saclab.training.requests import Stopped
+
+STEP, MESSAGE, DONE = b"s", b"m", b"."
+
+Arrays = dict[str, np.ndarray]
+Reply = tuple[dict[str, Any], Arrays]
+
+
+class Share(NamedTuple):
+    """The environments of one run that belong to this process."""
+
+    run: int
+    rows: slice
+    """Their places on the board."""
+    environments: TrainingEnvironments
+
+
+class EnvironmentWorker:
+    def __init__(self, task: dict[str, Any]) -> None:
+        """Make the environments and start their first episodes."""
+        self.board = Board(Sizes(**task["sizes"]), task["board"])
+        self.configs = {int(run): Config.from_dict(config) for run, config in task["configs"].items()}
+        self.shares = []
+        for share in task["shares"]:
+            config = self.configs[share["run"]]
+            environments = TrainingEnvironments(config.environment, config.environment_arguments, share["seeds"])
+            rows = slice(share["first"], share["first"] + len(share["seeds"]))
+            self.shares.append(Share(share["run"], rows, environments))
+            self.board.observation[rows] = environments.observation
+        any_config = next(iter(self.configs.values()))
+        self.evaluator = Evaluator(any_config.environment, any_config.environment_arguments)
+        self.spec = self.evaluator.spec
+        self.layout = RowLayout(self.spec.observation_size, self.spec.action_size)
+
+    def step(self) -> Reply:
+        """Step every active environment once; what went wrong in which run, and the numbers that belong to it."""
+        failures: dict[str, Any] = {}
+        arrays: Arrays = {}
+        for share in self.shares:
+            if not self.board.active[share.run]:
+                continue
+            try:
+                self._step(share)
+            except Exception as error:  # the environment is anybody's code: what it raises ends no other run
+                failures[str(share.run)] = described(error)
+                if isinstance(error, NonFiniteError):
+                    arrays |= {f"{share.run}.{name}": array for name, array in error.arrays.items()}
+        return failures, arrays
+
+    def _step(self, share: Share) -> None:
+        board, rows = self.board, share.rows
+        transitions, ended = share.environments.step(board.action[rows])
+        board.row[rows] = self.layout.pack(transitions)
+        board.observation[rows] = share.environments.observation
+        board.ended[rows] = False
+        for episode in ended:
+            place = rows.start + episode.environment
+            board.ended[place], board.terminated[place] = True, episode.terminated
+            board.total_reward[place], board.length[place] = episode.total_reward, episode.length
+
+    def answer(self, header: dict[str, Any], arrays: Arrays) -> Reply:
+        """The answer to a message."""
+        match header["do"]:
+            case "test":
+                return self.test(header["run"], header["seeds"], arrays["actor"])
+            case "q_bias":
+                return self.q_bias(header, arrays)
+            case "capture":
+                captured, rest = split_arrays(self._share(header["run"]).environments.capture())
+                return {"rest": rest}, captured
+            case "restore":
+                return self.restore(header, arrays)
+        raise ValueError(header["do"])
+
+    def test(self, run: int, test_seeds: list[int], actor: np.ndarray) -> Reply:
+        """One episode of the deterministic policy per seed."""
+        policy = self._learner(run).policy
+
+        def act(observation: np.ndarray) -> np.ndarray:
+            if self.board.stop[0]:
+                raise Stopped
+            action: np.ndarray = policy.mode(actor, observation)
+            return action
+
+        try:
+            episodes = self.evaluator.run(act, test_seeds)
+        except Stopped:
+            return {"stopped": True}, {}
+        except Exception as error:
+            return {"failure": described(error)}, {}
+        return {}, episodes._asdict()
+
+    def q_bias(self, header: dict[str, Any], arrays: Arrays) -> Reply:
+        """As `Run.q_bias`."""
+        config, number = self.configs[header["run"]], header["evaluations"]
+        learner = self._learner(header["run"])
+        critics = Critics(
+            learner.policy, arrays["actor"], learner.q_network, arrays["critic"], header["alpha"],
+            config.algorithm.discount,
+        )  # fmt: skip
+        try:
+            bias = measure_q_bias(
+                critics, self.evaluator.environments[0], self.spec,
+                seeds.integers(config.seed, "q_bias", config.training.q_bias_episodes, number),
+                seeds.generator(config.seed, "q_bias", number),
+            )  # fmt: skip
+        except Exception as error:
+            return {"failure": described(error)}, {}
+        return {"bias": list(bias)}, {}
+
+    def restore(self, header: dict[str, Any], arrays: Arrays) -> Reply:
+        """Continue the episodes; which environments started anew instead, or why the states do not fit."""
+        share = self._share(header["run"])
+        try:
+            states = join_arrays(arrays, header["rest"], share.environments.observation)
+            restarted = share.environments.restore(states, header["seeds"])
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
+            return {"misfit": str(error)}, {}
+        self.board.observation[share.rows] = share.environments.observation
+        return {"restarted": restarted}, {}
+
+    def _share(self, run: int) -> Share:
+        return next(share for share in self.shares if share.run == run)
+
+    def _learner(self, run: int) -> Any:
+        return make_learner(self.configs[run].algorithm, self.spec.observation_size, self.spec.action_size)
+
+
+def described(error: Exception) -> dict[str, str]:
+    """What the batch is told of an error in a run's environment."""
+    if isinstance(error, NonFiniteError):
+        return {"not_finite": str(error)}
+    return {"error": f"{type(error).__name__}: {error}", "traceback": "".join(traceback.format_exception(error))}
+
+
+def main() -> None:
+    """Answer until the input ends."""
+    commands, answers = os.dup(0), os.dup(1)
+    os.dup2(2, 1)  # what an environment prints must not end up among the answers
+    try:
+        worker = EnvironmentWorker(receive(commands)[0])
+    except UserError as error:
+        send(answers, {"user_error": str(error)})
+        return
+    send(answers, {})
+    while command := os.read(commands, 1):
+        if command == STEP:
+            failures, arrays = worker.step()
+            os.write(answers, MESSAGE if failures else DONE)
+            if failures:
+                send(answers, failures, arrays)
+        else:
+            send(answers, *worker.answer(*receive(commands)))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (EOFError, BrokenPipeError):
+        sys.exit(0)  # the batch is gone

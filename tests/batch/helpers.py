@@ -1,0 +1,88 @@
+"""What the tests of batches share: small runs of one structure, and stopping them at a chosen step."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from saclab.batch.batch import Batch
+from saclab.batch.loop import train_batch
+from saclab.config import Config
+from saclab.protocols import make_config
+from saclab.training.events import Event, Failed
+from saclab.training.requests import Requests
+
+TESTS = Path(__file__).parents[1]
+SMALL = {
+    "hidden_layers": (16, 16),
+    "batch_size": 32,
+    "random_steps": 60,
+    "update_interval": 2,
+    "replay_capacity": 150,  # it wraps around
+    "evaluation_interval_steps": 90,
+    "evaluation_episodes": 2,
+    "log_interval": 7,  # a window is open at any stop
+    "max_steps": 240,
+    "acting_delay": 1,
+}
+
+
+def config(variant: str = "sac-auto", seed: int = 0, environment: str = "Pendulum-v1", **changes: object) -> Config:
+    return make_config(environment, variant, "standard", seed, None, {**SMALL, **changes})
+
+
+def mixed(**changes: object) -> list[Config]:
+    """Runs of one batch that differ in the seed and in plain numbers."""
+    return [
+        config("sac", 0, **changes),
+        config("sac-auto", 1, **changes),
+        config("sac-auto", 2, discount=0.9, polyak_rate=0.02, actor_learning_rate=1e-3, **changes),
+    ]
+
+
+def folders(root: Path, configs: Sequence[Config]) -> list[Path]:
+    return [root / f"run-{index}" for index in range(len(configs))]
+
+
+def train(root: Path, configs: Sequence[Config], workers: int = 2, **options: object) -> list[tuple[int, Event]]:
+    """All that the batch tells; in folders that `folders` names."""
+    return list(train_batch(configs, folders(root, configs), workers=workers, **options))
+
+
+def failures(told: Sequence[tuple[int, Event]]) -> dict[int, str]:
+    return {run: event.message for run, event in told if isinstance(event, Failed)}
+
+
+@contextmanager
+def at_step(step: int, happens: Callable[[Batch], None]) -> Iterator[None]:
+    """Let something happen when the batch has done exactly so many steps."""
+    real = Batch.step
+
+    def step_and_more(batch: Batch, *arguments: object) -> object:
+        result = real(batch, *arguments)
+        if batch.steps == step:
+            happens(batch)
+        return result
+
+    with mock.patch.object(Batch, "step", step_and_more):
+        yield
+
+
+def stop_at(step: int, root: Path, configs: Sequence[Config]) -> list[tuple[int, Event]]:
+    """Train until so many steps are done; the batch saves and stops."""
+    requests = Requests()
+    with at_step(step, lambda batch: setattr(requests, "stop", 1)):
+        return train(root, configs, requests=requests)
+
+
+@contextmanager
+def tiny_environments(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Let the processes of a batch find the environments of `environments/tiny.py`; the prefix of their ids."""
+    paths = [str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+    yield "environments.tiny:"

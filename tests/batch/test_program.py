@@ -1,0 +1,100 @@
+"""What a batch computes is what each of its runs would compute alone."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from saclab.algorithm.numbers import numbers_of
+from saclab.batch.batch import alone, init_settings, number_arrays, of_batch
+from saclab.batch.program import Arrival, Program
+from saclab.replay import RowLayout
+from saclab.training import seeds
+from saclab.training.course import named_leaves
+from saclab.training.run import compiled_init, compiled_update
+
+from .helpers import config, mixed
+
+LAYOUT = RowLayout(3, 2)
+CAPACITY = 50
+
+
+def stacked(trees):
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
+
+
+@pytest.mark.parametrize("snapshots", [1, 3])
+def test_each_slot_is_updated_by_its_own_numbers(snapshots):
+    """Fixed and learned α, γ, τ, learning rates and the snapshot interval differ; rows are stored, then drawn."""
+    settings = [each.algorithm for each in mixed(snapshots=snapshots, batch_size=16)]
+    settings.append(config(snapshots=snapshots, batch_size=16, snapshot_interval=4, temperature="fixed",
+                           initial_temperature=0.0).algorithm)  # fmt: skip
+    states = [compiled_init(each, LAYOUT)(seeds.learner_key(run)) for run, each in enumerate(settings)]
+    random = np.random.default_rng(0)
+    rows = random.standard_normal((len(settings), CAPACITY, LAYOUT.width)).astype(np.float32)
+    drawn = random.integers(0, CAPACITY, (len(settings), 5, 16), np.int32)
+
+    program = Program(settings[0], LAYOUT, environments=2, slots=len(settings))
+    numbers = stacked([number_arrays(numbers_of(each, 2)) for each in settings])
+    newest = rows[:, [CAPACITY - 1, 0]]  # two environments: the second row wraps around
+    before = rows.copy()
+    before[:, [CAPACITY - 1, 0]] = 0
+    position = np.full(len(settings), CAPACITY - 1, np.int32)
+    packed = program.arrival(5).pack(len(settings), rows=newest, position=position, drawn=drawn)
+    state, replay, metrics = program.advance(
+        5, numbers, program.put(stacked([of_batch(each) for each in states])), program.put(before), program.put(packed)
+    )
+    np.testing.assert_array_equal(replay, rows)
+    for run, own in enumerate(settings):
+        expected = states[run]
+        update = compiled_update(own, LAYOUT)
+        for turn in range(5):
+            expected, values = update(expected, rows[run][drawn[run, turn]])
+            np.testing.assert_allclose(metrics[run, turn], values, rtol=2e-4, atol=2e-5)
+        found = named_leaves(alone(jax.tree.map(lambda leaf, run=run: leaf[run], state), own))
+        assert found.keys() == named_leaves(expected).keys()
+        for name, value in named_leaves(expected).items():
+            np.testing.assert_allclose(found[name], value, rtol=1e-3, atol=2e-5, err_msg=f"{run}{name}")
+
+
+def test_actions_are_those_of_each_runs_policy():
+    configs = mixed()
+    states = [compiled_init(each.algorithm, LAYOUT)(seeds.learner_key(each.seed)) for each in configs]
+    program = Program(configs[0].algorithm, LAYOUT, environments=4, slots=3)
+    numbers = stacked([number_arrays(numbers_of(each.algorithm, 2)) for each in configs])
+    random = np.random.default_rng(1)
+    observation = random.standard_normal((3, 4, 3)).astype(np.float32)
+    noise = random.standard_normal((3, 4, 2)).astype(np.float32)
+    packed = program.arrival(1).pack(3, observation=observation, noise=noise)
+    action = program.act(numbers, stacked([each.actor for each in states]), packed)
+    policy = program._learner(numbers_of(configs[0].algorithm, 2)).policy
+    for run, state in enumerate(states):
+        expected = policy.act(np.asarray(state.actor), observation[run], noise[run])
+        np.testing.assert_allclose(action[run], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_what_arrives_is_taken_apart_bit_for_bit():
+    """Also numbers that are no normal floating-point numbers, and whole numbers, whose bits are tiny ones."""
+    arrival = Arrival(LAYOUT, environments=2, updates=3, batch_size=4)
+    parts = {
+        "observation": np.array([[[np.nan, -0.0, 1e-42], [1, 2, 3]]], np.float32),
+        "noise": np.arange(4, dtype=np.float32).reshape(1, 2, 2),
+        "rows": np.arange(2 * LAYOUT.width, dtype=np.float32).reshape(1, 2, -1),
+        "position": np.array([7], np.int32),
+        "drawn": np.arange(12, dtype=np.int32).reshape(1, 3, 4),
+    }
+    packed = arrival.pack(2, **parts)
+    assert packed.shape == (2, 6 + 4 + 2 * LAYOUT.width + 1 + 12)
+    assert (packed[1] == 0).all()
+    for name, part in parts.items():
+        found = np.asarray(jax.jit(lambda slot, name=name: arrival.unpack(slot, name))(jnp.asarray(packed[0])))
+        assert found.dtype == part.dtype
+        assert found.tobytes() == part[0].tobytes(), name
+
+
+def test_runs_that_differ_in_plain_numbers_start_from_one_compiled_function():
+    first, second = (each.algorithm for each in mixed()[1:])
+    assert first != second
+    assert init_settings(first) == init_settings(second)

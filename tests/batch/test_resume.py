@@ -1,0 +1,112 @@
+"""A batch that was stopped, killed or broken off at any moment goes on as if nothing had been."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import pytest
+from resume.helpers import assert_same_run
+
+from saclab.batch.batch import Batch
+from saclab.batch.loop import train_batch
+from saclab.batch.pool import EnvironmentWorkerDied
+from saclab.training import loop
+from saclab.training.checkpoint import CheckpointError, batch_slots, checkpoint_steps
+from saclab.training.events import Evaluated, Interrupted, Saved, UpdatesLogged
+from saclab.training.requests import Requests
+from saclab.training.run_folder import is_finished, read_run
+
+from .helpers import at_step, folders, mixed, stop_at, train
+
+
+@pytest.mark.parametrize("environment", ["Pendulum-v1", pytest.param("Hopper-v4", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stop", [50, 149])
+def test_a_stopped_batch_goes_on_bit_for_bit(tmp_path, environment, stop):
+    """In the random steps and after, with a window of metrics, a round of updates and an episode under way."""
+    configs = mixed(environment=environment, snapshots=2)
+    train(tmp_path / "straight", configs)
+    told = stop_at(stop, tmp_path / "stopped", configs)
+    assert [event for _, event in told[-3:]] == [Interrupted(stop)] * 3
+    assert not any(is_finished(folder) for folder in folders(tmp_path / "stopped", configs))
+    train(tmp_path / "stopped", configs)
+    for straight, stopped in zip(
+        folders(tmp_path / "straight", configs), folders(tmp_path / "stopped", configs), strict=True
+    ):
+        assert_same_run(straight, stopped)
+
+
+@pytest.mark.slow
+def test_saving_changes_nothing(tmp_path):
+    """A checkpoint brings the devices up to date before the next step would."""
+    configs = mixed()
+    train(tmp_path / "straight", configs)
+    told = train(tmp_path / "saved", configs, checkpoint_minutes=0)
+    assert sum(isinstance(event, Saved) for _, event in told) > 500
+    assert_same_run(tmp_path / "straight/run-2", tmp_path / "saved/run-2")
+
+
+def test_a_stop_in_the_middle_of_a_test_leaves_the_test_to_be_made(tmp_path):
+    configs = mixed()
+    train(tmp_path / "straight", configs)
+    requests = Requests()
+    events = train_batch(configs, folders(tmp_path / "stopped", configs), requests, workers=2)
+    real = Batch.test
+
+    def ask_and_test(batch, members, asked_to_stop):
+        requests.stop = 1
+        return real(batch, members, asked_to_stop)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Batch, "test", ask_and_test)
+        told = list(events)
+    assert isinstance(told[-1][1], Interrupted)
+    assert not any(isinstance(event, Evaluated) for _, event in told)
+    train(tmp_path / "stopped", configs)
+    assert_same_run(tmp_path / "straight/run-1", tmp_path / "stopped/run-1")
+
+
+def test_a_crash_while_saving_goes_back_to_the_step_that_all_have(tmp_path):
+    """Some runs have the newest checkpoint then, the others only the one before."""
+    configs = mixed()
+    train(tmp_path / "straight", configs)
+    requests, saves = Requests(), 0
+    with closing(train_batch(configs, folders(tmp_path / "killed", configs), requests, workers=2)) as events:
+        for _, event in events:
+            saves += isinstance(event, Saved)
+            if saves == 4:
+                break  # two runs have a second one
+            requests.save = isinstance(event, UpdatesLogged)
+    steps = [checkpoint_steps(folder) for folder in folders(tmp_path / "killed", configs)]
+    assert [len(found) for found in steps] == [2, 1, 1]
+    train(tmp_path / "killed", configs)
+    for index in range(3):
+        assert_same_run(tmp_path / f"straight/run-{index}", tmp_path / f"killed/run-{index}")
+
+
+def test_runs_that_are_not_equally_far_are_no_batch(tmp_path):
+    configs = mixed()
+    stop_at(50, tmp_path, configs[:1])
+    with pytest.raises(CheckpointError, match=r"no whole checkpoint of the same step: .*run-0 has step-000000000050"):
+        train(tmp_path, configs)
+
+
+def test_a_run_of_a_batch_can_go_on_alone_and_says_that_bits_may_differ(tmp_path):
+    configs = mixed()
+    stop_at(150, tmp_path, configs)
+    assert batch_slots(tmp_path / "run-0") == 3
+    told = list(loop.train(configs[0], tmp_path / "run-0"))
+    assert any("batch was 3 when the checkpoint was made and is 0 now" in note for note in told[0].notes)
+    assert read_run(tmp_path / "run-0").result["steps"] == 240
+
+
+def test_a_batch_whose_process_is_killed_goes_on_bit_for_bit(tmp_path):
+    configs = mixed()
+    train(tmp_path / "straight", configs)
+    with (
+        at_step(121, lambda batch: batch.pool.workers[0].process.kill()),
+        pytest.raises(EnvironmentWorkerDied, match="killed by SIGKILL"),
+    ):
+        train(tmp_path / "killed", configs, checkpoint_minutes=0.001)
+    train(tmp_path / "killed", configs)
+    for index in range(3):
+        assert_same_run(tmp_path / f"straight/run-{index}", tmp_path / f"killed/run-{index}")

@@ -12,6 +12,7 @@ from tensorboardX.proto.event_pb2 import Event
 
 from saclab import trackers
 from saclab.errors import UserError
+from saclab.extras import required
 from saclab.protocols import make_config
 from saclab.training.loop import train
 from saclab.training.run_folder import read_run
@@ -51,5 +52,5 @@ def test_tensorboard_files_hold_the_runs_numbers(tmp_path: Path) -> None:
 
 
 def test_a_missing_extra_says_how_to_install_it() -> None:
-    with pytest.raises(UserError, match=r"pip install 'saclab\[thing\]'"):
-        trackers.required("no_such_package_for_sure", "thing")
+    with pytest.raises(UserError, match=r"--thing needs .*pip install 'saclab\[thing\]'"):
+        required("no_such_package_for_sure", "thing", "--thing")

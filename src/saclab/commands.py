@@ -10,7 +10,7 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, Suppress
 
@@ -117,9 +117,22 @@ class Compare:
     first_seed: int = 0
     """The other seeds follow it."""
     workers: int | None = None
-    """Runs at a time; None for one per core."""
-    threads: int = 1
-    """Cores that each run uses. Results depend on it in the last bits."""
+    """Runs at a time; of a batch, the processes that step its environments. None for one per core, or on Ray as many
+    tasks as the cluster has room for."""
+    threads: int | None = None
+    """Cores that XLA uses for each run, or for a batch; None for one, or for all. Results depend on it in the last
+    bits."""
+    batch: int | None = None
+    """Runs of the same structure that are trained as one batch, their replay buffers on the device; 0 for each alone.
+    None for 16 on an accelerator, else 0. In a batch acting_delay is 1, unless it is given."""
+    launcher: Literal["local", "ray"] = "local"
+    """Processes on this machine, or a Ray cluster whose machines share the runs' folder; needs the extra `ray`."""
+    ray_address: str | None = None
+    """Of the cluster; None for RAY_ADDRESS, else the one that runs on this machine, else one that is started."""
+    ray_cpus: float | None = None
+    """Cores that Ray sets aside for each run, or for a batch; None for threads."""
+    ray_gpus: float = 0.0
+    """GPUs, or the part of one, that Ray sets aside for each run, or for a batch; 0 trains on cores."""
     report: Path | None = None
     """Folder of the report; None for report in the runs' folder."""
     where: OmitArgPrefixes[Where] = field(default_factory=Where)
@@ -140,10 +153,12 @@ class Compare:
         }
         result = api.compare(
             self.environments, self.variants, range(self.first_seed, self.first_seed + count), self.protocol,
-            workers=self.workers, threads=self.threads, runs=self.where.runs, report=self.report,
+            workers=self.workers, threads=self.threads, batch=self.batch, runs=self.where.runs, report=self.report,
+            tell=lambda text: console.print(text, soft_wrap=True, highlight=False),
             environment_arguments=parse_arguments(self.where.environment_arguments),
             show=lambda stream: display.show_grid(stream, console),
-            checkpoint_minutes=self.where.checkpoint_minutes, **overrides,
+            checkpoint_minutes=self.where.checkpoint_minutes, launcher=self.launcher, ray_address=self.ray_address,
+            ray_cpus=self.ray_cpus, ray_gpus=self.ray_gpus, **overrides,
         )  # fmt: skip
         return display.show_comparison(result, console)
 
@@ -161,7 +176,9 @@ class Reproduce:
     updates: int | None = None
     """Fewer updates than the paper's; the report says that it is scaled down."""
     workers: int | None = None
-    """Runs at a time, one core each; None for one per core."""
+    """Runs at a time, one core each; of a batch, the processes that step its environments. None for one per core."""
+    batch: int | None = None
+    """Runs of the same structure that are trained as one batch; 0 for each alone, None for 16 on an accelerator."""
     report: Path | None = None
     """Folder of the report; None for report in the runs' folder."""
     runs: Path = Path("runs")
@@ -173,7 +190,8 @@ class Reproduce:
         from saclab import api, display
 
         result = api.reproduce(
-            self.environments, self.variants, self.seeds, self.updates, workers=self.workers, runs=self.runs,
+            self.environments, self.variants, self.seeds, self.updates, workers=self.workers, batch=self.batch,
+            runs=self.runs,
             report=self.report, show=lambda stream: display.show_grid(stream, console),
             tell=lambda text: console.print(text, soft_wrap=True), checkpoint_minutes=self.checkpoint_minutes,
         )  # fmt: skip

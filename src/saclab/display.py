@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
 from saclab.api import Comparison
-from saclab.comparison.launch import RunStatus
+from saclab.comparison.tasks import RunStatus
 from saclab.config import TrainingSettings
 from saclab.signals import EXIT_STATUS
 from saclab.training import events

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from saclab.config import Config
-from saclab.errors import UserError
+from saclab.extras import required
 from saclab.training import events
 
 Log = Callable[[Mapping[str, float], int], None]
@@ -54,7 +52,7 @@ def tensorboard(stream: Iterable[events.Event]) -> Iterator[events.Event]:
     Raises:
         UserError: if the extra is not installed.
     """
-    writer_type = required("tensorboardX", "tensorboard").SummaryWriter
+    writer_type = required("tensorboardX", "tensorboard", "--tensorboard").SummaryWriter
 
     def start(event: events.Started) -> tuple[Log, Callable[[], None]]:
         writer = writer_type(str(event.run / "tensorboard"), purge_step=event.resumed_at_step + 1)
@@ -74,7 +72,7 @@ def wandb(stream: Iterable[events.Event], project: str, config: Config, folder: 
     Raises:
         UserError: if the extra is not installed.
     """
-    module = required("wandb", "wandb")
+    module = required("wandb", "wandb", "--wandb")
 
     def start(event: events.Started) -> tuple[Log, Callable[[], None]]:
         name = "-".join(folder.parts[-4:])
@@ -83,11 +81,3 @@ def wandb(stream: Iterable[events.Event], project: str, config: Config, folder: 
         return (lambda values, step: run.log(dict(values), step=step)), run.finish
 
     return track(stream, start)
-
-
-def required(module: str, extra: str) -> Any:
-    """Import an optional package, or say how to install it."""
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise UserError(f"--{extra} needs the package {module}: pip install 'saclab[{extra}]'") from error

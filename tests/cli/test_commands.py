@@ -100,14 +100,19 @@ def test_report_reads_run_folders(trained: Path) -> None:
     assert (trained / "elsewhere" / "index.html").is_file()
 
 
-def test_reproduce_forecasts_the_time_runs_the_papers_protocol_and_says_that_it_is_scaled_down(tmp_path: Path) -> None:
-    arguments = ("reproduce", "--environments", "Pendulum-v1", "--variants", "sac", "--seeds", "1", "--updates", "20")
+@pytest.mark.parametrize("batch", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_reproduce_forecasts_the_time_runs_the_papers_protocol_and_says_that_it_is_scaled_down(
+    tmp_path: Path, batch: int
+) -> None:
+    arguments = ("reproduce", "--environments", "Pendulum-v1", "--variants", "sac", "--seeds", "1", "--updates", "20",
+                 "--batch", str(batch))  # fmt: skip
     result = saclab(*arguments, folder=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "1 of 1 runs to do" in result.stdout
     assert re.search(r"forecast: about \d+ minutes with \d+ worker", result.stdout)
     run = read_run(tmp_path / "runs/Pendulum-v1/sac/paper/seed-0")
-    assert run.config.training.update_interval == 5
+    assert (run.config.training.update_interval, run.config.training.acting_delay) == (5, int(batch > 0))
+    assert run.machine["batch"] == min(batch, 1)
     assert run.config.training.q_bias_episodes == 2
     assert len(run.q_bias["evaluation"]) == len(run.evaluations["evaluation"]) > 0
     assert "Scaled down" in (tmp_path / "runs/report/index.html").read_text()

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from saclab.comparison.grid import Cell, make_grid
-from saclab.comparison.launch import RunStatus, core_groups, launch
+from saclab.comparison.launch import core_groups, launch
+from saclab.comparison.tasks import RunStatus
 from saclab.training.machine import usable_cores
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished

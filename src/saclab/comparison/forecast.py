@@ -9,10 +9,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from contextlib import closing
+from typing import NamedTuple
 
 from saclab.comparison.grid import Cell
 from saclab.comparison.launch import thread_limits
+from saclab.comparison.tasks import make_statuses, make_tasks
 from saclab.config import Config
 
 WARM_UPDATES, MEASURED_UPDATES = 5, 40
@@ -27,20 +29,42 @@ class Cost(NamedTuple):
     """One environment step alone."""
 
 
-def forecast_hours(cells: Sequence[Cell], workers: int, threads: int) -> float:
+class Kind(NamedTuple):
+    """What is measured: a run, or several as one batch."""
+
+    configs: tuple[Config, ...]
+    slots: int
+    """Of the batch; 0 for a run alone."""
+    workers: int
+    """Processes that step the environments of a batch."""
+
+
+def forecast_hours(cells: Sequence[Cell], workers: int, threads: int, batch: int = 0) -> float:
     """Hours until every unfinished cell is at its limits, if all goes on as a few updates of each kind did.
+
+    Args:
+        cells: the grid.
+        workers: as `launch.launch` takes it.
+        threads: as `launch.launch` takes it.
+        batch: as `launch.launch` takes it.
 
     Raises:
         UserError: if an environment cannot be made.
     """
-    kinds: dict[tuple[str, str], Config] = {}
-    unfinished = [cell.config for cell in cells if not cell.finished]
-    for config in unfinished:
-        kinds.setdefault((config.environment, config.variant), config)
+    tasks = make_tasks(make_statuses(cells), batch)
+    kinds: dict[object, Kind] = {}
+    names = []
+    for task in tasks:
+        configs = tuple(run.cell.config for run in task.runs)
+        names.append((configs[0].environment, task.slots, *sorted({config.variant for config in configs})))
+        kinds.setdefault(names[-1], Kind(configs, task.slots, workers))
     costs = dict(zip(kinds, measure_in_process([*kinds.values()], threads), strict=True))
-    seconds = [run_seconds(config, costs[config.environment, config.variant]) for config in unfinished]
+    seconds = [
+        max(run_seconds(run.cell.config, costs[name]) for run in task.runs)
+        for task, name in zip(tasks, names, strict=True)
+    ]
     longest = max(seconds, default=0.0)
-    return max(sum(seconds) / workers, longest) / 3600
+    return max(sum(seconds) / (1 if batch else workers), longest) / 3600
 
 
 def run_seconds(config: Config, cost: Cost) -> float:
@@ -64,11 +88,12 @@ def run_seconds(config: Config, cost: Cost) -> float:
     return updates * cost.per_update + (training.random_steps + tested) * cost.per_step
 
 
-def measure_in_process(configs: Sequence[Config], threads: int) -> list[Cost]:
-    """Measure each configuration one after the other, in a process with as many threads as a worker has."""
+def measure_in_process(kinds: Sequence[Kind], threads: int) -> list[Cost]:
+    """Measure each kind one after the other, in a process with as many threads as a worker has."""
+    described = [([config.to_dict() for config in kind.configs], kind.slots, kind.workers) for kind in kinds]
     process = subprocess.run(
         [sys.executable, "-m", "saclab.comparison.forecast"],
-        input=json.dumps([config.to_dict() for config in configs]).encode(),
+        input=json.dumps(described).encode(),
         stdout=subprocess.PIPE,
         check=True,
         env=os.environ | thread_limits(threads),
@@ -76,36 +101,54 @@ def measure_in_process(configs: Sequence[Config], threads: int) -> list[Cost]:
     return [Cost(*values) for values in json.loads(process.stdout)]
 
 
-def measure(config: Config) -> Cost:
-    """Train for a moment: nothing is written."""
+def measure(kind: Kind) -> Cost:
+    """Train for a moment: nothing is written. Of a batch, an update is one of all its runs."""
+    import numpy as np
+
+    from saclab.batch.batch import Batch
+    from saclab.training.course import Course
     from saclab.training.process import prepare_process
     from saclab.training.run import Run
 
     prepare_process()
-    random_steps = config.algorithm.batch_size
-    without_end = dataclasses.replace(
-        config.training, random_steps=random_steps, max_updates=None, max_steps=sys.maxsize
+    configs = [endless(config) for config in kind.configs]
+    trained: Run | Batch
+    if kind.slots:
+        trained = Batch(configs, kind.slots, kind.workers)
+        trained.begin()
+        run: Course = trained.members[0]
+    else:
+        trained = run = Run(configs[0])
+    counters, random_steps = run.counters, run.config.training.random_steps
+    with closing(trained):
+        began = time.perf_counter()
+        while counters.steps < random_steps:
+            trained.step()
+        per_step = (time.perf_counter() - began) / counters.steps
+        while counters.updates < WARM_UPDATES:
+            trained.step()
+        np.array(run.actor)  # waits for the updates
+        began, first = time.perf_counter(), counters.updates
+        while counters.updates < first + MEASURED_UPDATES:
+            trained.step()
+        np.array(run.actor)
+        return Cost((time.perf_counter() - began) / (counters.updates - first), per_step)
+
+
+def endless(config: Config) -> Config:
+    """The same run with the shortest random phase and no end."""
+    training = dataclasses.replace(
+        config.training, random_steps=config.algorithm.batch_size, max_updates=None, max_steps=sys.maxsize
     )
-    run = Run(dataclasses.replace(config, training=without_end))
-    began = time.perf_counter()
-    while run.counters.steps < random_steps:
-        run.step()
-    per_step = (time.perf_counter() - began) / run.counters.steps
-    while run.counters.updates < WARM_UPDATES:
-        run.step()
-    run.learner_state.actor.block_until_ready()
-    began, first = time.perf_counter(), run.counters.updates
-    while run.counters.updates < first + MEASURED_UPDATES:
-        run.step()
-    run.learner_state.actor.block_until_ready()
-    per_update = (time.perf_counter() - began) / (run.counters.updates - first)
-    run.close()
-    return Cost(per_update, per_step)
+    return dataclasses.replace(config, training=training)
 
 
 def main() -> None:
-    configs: list[dict[str, Any]] = json.load(sys.stdin)
-    print(json.dumps([measure(Config.from_dict(config)) for config in configs]))
+    kinds = [
+        Kind(tuple(Config.from_dict(config) for config in configs), slots, workers)
+        for configs, slots, workers in json.load(sys.stdin)
+    ]
+    print(json.dumps([measure(kind) for kind in kinds]))
 
 
 if __name__ == "__main__":

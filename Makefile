@@ -31,10 +31,11 @@ types: $(VENV)/installed
 
 benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other libraries: leave the machine alone for half an hour
 	$(BIN)/python benchmarks/speed.py --peers $(PEERS)/bin/python
-	$(BIN)/python benchmarks/tables.py
+	$(BIN)/python benchmarks/tables.py speed
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/memory.py
+	$(BIN)/python benchmarks/batches.py HalfCheetah-v4 --runs 1 4 16 --alone
 
 $(PEERS)/installed: benchmarks/peers.txt
 	$(PYTHON) -m venv $(PEERS)

@@ -1,6 +1,9 @@
-"""Make the tables of the README from the results: python benchmarks/tables.py [--write README.md]
+"""Make the tables of the documentation from the results.
 
-A table stands between `<!-- speed -->` and `<!-- /speed -->`, and is replaced.
+    python benchmarks/tables.py speed [--write README.md]
+    python benchmarks/tables.py batches [--write docs/where-to-run.md]
+
+A table stands between `<!-- speed -->` and `<!-- /speed -->`, and is replaced; so for the other name.
 """
 
 from __future__ import annotations
@@ -59,6 +62,38 @@ def peers_of(record: dict[str, Any]) -> str:
     return ", ".join(f"{name} {version}" for name, version in sorted(found.items()))
 
 
+def batches_tables() -> str:
+    """One table per device and environment that batches.py has measured."""
+    tables = []
+    for path in sorted(RESULTS.glob("batches-*.json")):
+        record = json.loads(path.read_text())
+        machine, versions = record["machine"], record["versions"]
+        tables += [
+            f"{record['environment']} on {machine['device']} ({machine['processor']}, {record['cores']} cores); "
+            f"{record['date'][:10]}; Python {versions['python']}, jax {versions['jax']}. In brackets: the share of a "
+            "step in which the host waits for actions.",
+            "",
+            "| variant | runs of the batch | program alone, updates/s | batch, steps/s | one run alone, steps/s "
+            "| one run per core, steps/s | peak so far, MiB |",
+            "|---|---|---|---|---|---|---|",
+            *(batches_row(row) for row in record["rows"]),
+            "",
+        ]
+    return "\n".join(tables).rstrip()
+
+
+def batches_row(row: dict[str, Any]) -> str:
+    waiting = row["shares"]["waiting for actions"]
+    peak = row["device_peak_bytes"] or row["process_peak_bytes"]
+    cells = [
+        row["variant"], str(row["runs"]), f"{row['program_updates_per_second']:.0f}",
+        f"{row['steps_per_second']:.0f} ({waiting:.2f})",
+        *(f"{row[name]:.0f}" if name in row else "" for name in ("one_run", "one_run_per_core")),
+        f"{peak / 2**20:.0f}",
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
 def replace_between(text: str, name: str, table: str) -> str:
     before, start, rest = text.partition(f"<!-- {name} -->")
     _, end, after = rest.partition(f"<!-- /{name} -->")
@@ -69,13 +104,15 @@ def replace_between(text: str, name: str, table: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", choices=("speed", "batches"))
     parser.add_argument("--write", type=Path, help="the file to put the table into; printed otherwise")
     options = parser.parse_args()
-    table = speed_table(json.loads((RESULTS / "speed.json").read_text()))
+    speed = options.name == "speed"
+    table = speed_table(json.loads((RESULTS / "speed.json").read_text())) if speed else batches_tables()
     if options.write is None:
         print(table)
         return
-    options.write.write_text(replace_between(options.write.read_text(), "speed", table))
+    options.write.write_text(replace_between(options.write.read_text(), options.name, table))
 
 
 if __name__ == "__main__":

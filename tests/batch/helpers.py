@@ -9,6 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from resume.helpers import SMALL as ALONE
 
 from saclab.batch.batch import Batch
 from saclab.batch.loop import train_batch
@@ -18,18 +19,7 @@ from saclab.training.events import Event, Failed
 from saclab.training.requests import Requests
 
 TESTS = Path(__file__).parents[1]
-SMALL = {
-    "hidden_layers": (16, 16),
-    "batch_size": 32,
-    "random_steps": 60,
-    "update_interval": 2,
-    "replay_capacity": 150,  # it wraps around
-    "evaluation_interval_steps": 90,
-    "evaluation_episodes": 2,
-    "log_interval": 7,  # a window is open at any stop
-    "max_steps": 240,
-    "acting_delay": 1,
-}
+SMALL = {**ALONE, "evaluation_episodes": 2, "acting_delay": 1}
 
 
 def config(variant: str = "sac-auto", seed: int = 0, environment: str = "Pendulum-v1", **changes: object) -> Config:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from saclab.algorithm.numbers import numbers_of
-from saclab.batch.batch import alone, init_settings, number_arrays, of_batch
+from saclab.batch.batch import number_arrays
+from saclab.batch.member import alone, init_settings, of_batch
 from saclab.batch.program import Arrival, Program
 from saclab.replay import RowLayout
 from saclab.training import seeds

@@ -9,6 +9,7 @@ import pytest
 from resume.helpers import assert_same_run
 
 import saclab
+from saclab import api
 from saclab.comparison.batches import batches, structure
 from saclab.comparison.grid import Cell, make_grid
 from saclab.comparison.launch import launch
@@ -162,6 +163,15 @@ def test_acting_delay_0_is_kept_if_it_is_asked_for(tmp_path):
     result = saclab.compare(["Pendulum-v1"], ["sac"], 1, "quick", batch=1, runs=tmp_path,
                             **{**SETTINGS, "acting_delay": 0})  # fmt: skip
     assert result.runs[0].config.training.acting_delay == 0
+
+
+@pytest.mark.parametrize("present", [True, False])
+def test_batches_are_made_where_there_is_an_accelerator(monkeypatch, present):
+    monkeypatch.setattr(api, "accelerator", lambda: present)
+    assert api.chosen_batch(None) == (16 if present else 0)
+    assert api.chosen_batch(None, "ray", ray_gpus=0.5) == 16
+    assert api.chosen_batch(None, "ray", ray_gpus=0.0) == 0
+    assert (api.chosen_batch(0), api.chosen_batch(3)) == (0, 3)
 
 
 def test_a_negative_batch_is_refused(tmp_path):

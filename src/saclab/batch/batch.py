@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import optax
 
 from saclab.algorithm.numbers import Numbers, numbers_of
 from saclab.algorithm.types import LearnerState
+from saclab.batch.member import Member, MemberReplay, init_settings
 from saclab.batch.pool import EnvironmentPool, Job, error_of
 from saclab.batch.program import Program
-from saclab.config import AlgorithmSettings, Config, field_names
+from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec, environment_spec, make_environment
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken
 from saclab.replay import ReplayBuffer, RowLayout, draw, require_memory
-from saclab.training import seeds
-from saclab.training.course import Course
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.q_bias import QBias
-from saclab.training.run import compiled_init
 
 TEST_EPISODES_PER_JOB = 5  # stepped side by side; a fixed number, as results depend on it in the last bits
 
@@ -294,93 +290,6 @@ class Batch:
         return empty
 
 
-class BeforeBegin(NamedTuple):
-    """Of a run whose batch has not begun: the learner, and the acting policy f32[P] if a checkpoint tells it."""
-
-    learner: LearnerState
-    acting: np.ndarray | None
-
-
-class Member(Course):
-    """A run of a batch."""
-
-    def __init__(self, batch: Batch, slot: int, config: Config) -> None:
-        super().__init__(config)
-        self.batch, self.slot, self.spec = batch, slot, batch.spec
-        self.active = True
-        self.replay: Any = MemberReplay(batch, slot)
-        alone = compiled_init(init_settings(config.algorithm), batch.layout)(seeds.learner_key(config.seed))
-        self.before_begin = BeforeBegin(of_batch(alone), None)
-
-    @property
-    def actor(self) -> np.ndarray:
-        if self._begun:
-            return np.array(self.batch.actors_on_host()[self.slot])
-        return np.asarray(self.before_begin.learner.actor)
-
-    @property
-    def acting(self) -> np.ndarray:
-        self.batch.flush()
-        everyone = np.array(self.batch.acting)
-        return np.asarray(everyone[self.slot])
-
-    @property
-    def observation(self) -> np.ndarray:
-        return self.batch.pool.observation(self.slot)
-
-    @property
-    def window_size(self) -> int:
-        return len(self.window) + self.batch.undelivered_updates
-
-    def window_array(self) -> np.ndarray:
-        self.batch.deliver_metrics()
-        return super().window_array()
-
-    def learner(self) -> LearnerState:
-        if not self._begun:
-            return alone(self.before_begin.learner, self.config.algorithm)
-        mine = jax.tree.map(lambda leaf: leaf[self.slot], self.batch.on_host())
-        return alone(mine, self.config.algorithm)
-
-    def take_learner(self, state: LearnerState, acting: np.ndarray | None) -> None:
-        self.before_begin = BeforeBegin(of_batch(state), acting)
-
-    def capture_environments(self) -> list[dict[str, Any] | None]:
-        return self.batch.pool.capture(self.slot)
-
-    def restore_environments(self, states: list[dict[str, Any] | None], new_seeds: list[int]) -> list[int]:
-        return self.batch.pool.restore(self.slot, states, new_seeds)
-
-    @property
-    def _begun(self) -> bool:
-        return hasattr(self.batch, "state")
-
-
-class MemberReplay:
-    """A run's replay buffer on a device, as far as a checkpoint has to read it."""
-
-    def __init__(self, batch: Batch, slot: int) -> None:
-        self.batch, self.slot = batch, slot
-        self.layout, self.capacity = batch.layout, batch.config.training.replay_capacity
-
-    @property
-    def added(self) -> int:
-        return self.batch.steps
-
-    @property
-    def size(self) -> int:
-        return min(self.added, self.capacity)
-
-    @property
-    def rows(self) -> MemberReplay:
-        return self
-
-    def __getitem__(self, key: Any) -> np.ndarray:
-        """As of an array f32[capacity, width]."""
-        self.batch.flush()
-        return np.asarray(self.batch.replay[self.slot, key])
-
-
 program_of = lru_cache(maxsize=4)(Program)  # batches of one grid mostly have the same one
 
 
@@ -390,31 +299,10 @@ def set_slot(replay: jax.Array, slot: int, rows: np.ndarray) -> jax.Array:
     return replay.at[slot].set(rows)
 
 
-def of_batch(state: LearnerState) -> LearnerState:
-    """A run's state as the program takes it: with Adam's moments for the temperature, even if it is fixed."""
-    moments = state.optimizers.temperature
-    if isinstance(moments, optax.EmptyState):
-        moments = optax.adam(0.0).init(np.float32(0))
-    return state._replace(optimizers=state.optimizers._replace(temperature=moments))
-
-
-def alone(state: LearnerState, settings: AlgorithmSettings) -> LearnerState:
-    """The inverse of `of_batch`."""
-    if settings.temperature == "learned":
-        return state
-    return state._replace(optimizers=state.optimizers._replace(temperature=optax.EmptyState()))
-
-
-def init_settings(settings: AlgorithmSettings) -> AlgorithmSettings:
-    """The same for all runs that start from their keys in the same way, so that this is compiled once for them."""
-    plain = AlgorithmSettings()
-    unused = set(Numbers._fields) & set(field_names(AlgorithmSettings))
-    return dataclasses.replace(settings, **{name: getattr(plain, name) for name in unused})
-
-
 def number_arrays(numbers: Numbers) -> Numbers:
-    kinds = {bool: np.bool_, int: np.int32, float: np.float32}
-    return Numbers(*(kinds[type(number)](number) for number in numbers))
+    """Each of the same type for all runs, also where a user has written 1 for 1.0."""
+    kinds = {"temperature_learned": np.bool_, "snapshot_interval": np.int32}
+    return Numbers(**{name: kinds.get(name, np.float32)(number) for name, number in numbers._asdict().items()})
 
 
 def joined(replies: Sequence[Job]) -> EvaluationEpisodes | RunBroken:

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
-from saclab.batch.batch import Batch, Member
+from saclab.batch.batch import Batch
+from saclab.batch.member import Member
 from saclab.config import Config
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
 from saclab.replay import ReplayBuffer

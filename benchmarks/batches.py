@@ -21,18 +21,17 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
-from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from keep import keep
 
 from saclab.batch.batch import Batch
 from saclab.comparison.launch import thread_limits
 from saclab.config import Config
 from saclab.protocols import make_config
-from saclab.training.machine import machine_facts, usable_cores
+from saclab.training.machine import usable_cores
 from saclab.training.process import device_name, prepare_process
 from saclab.training.run import Run
 
@@ -162,18 +161,17 @@ def main() -> None:
         print(one_alone(options.environment, options.one[0], options.seconds))
         return
     name = device_name()
-    record: dict[str, Any] = {
-        "date": datetime.now(UTC).isoformat(timespec="minutes"), **machine_facts(name), "command": sys.argv[1:],
-        "environment": options.environment, "cores": len(usable_cores()), "rows": [],
-    }  # fmt: skip
+    rows = []
     print(f"{options.environment} on {name}, {len(usable_cores())} cores")
     for variant in ("sac", "averaged"):
         for runs in options.runs:
             row = measure(options, variant, runs)
-            record["rows"].append(row)
+            rows.append(row)
             print(json.dumps(row), flush=True)
-    path = Path(__file__).parent / "results" / f"batches-{name.replace(' ', '-').lower()}-{options.environment}.json"
-    path.write_text(json.dumps(record, indent=1) + "\n")
+    keep(
+        f"batches-{name.replace(' ', '-').lower()}-{options.environment}", name,
+        command=sys.argv[1:], environment=options.environment, rows=rows,
+    )  # fmt: skip
 
 
 def measure(options: argparse.Namespace, variant: str, runs: int) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 import mujoco
+from keep import keep
 from operations import matrix_products
 
 from saclab.environments.vector import TrainingEnvironments
@@ -169,7 +170,9 @@ def main() -> None:
     what = f"{options.environment}, {options.variant}"
     loop = loop_breakdown(options.environment, options.variant, options.updates)
     show(f"{what}: per update, with its 5 environment steps and their share of the tests", loop)
-    show(f"{what}: one update", update_breakdown(options.environment, options.variant, options.updates))
+    update = update_breakdown(options.environment, options.variant, options.updates)
+    show(f"{what}: one update", update)
+    keep(f"breakdown-{options.environment}-{options.variant}", loop_milliseconds=loop, update_milliseconds=update)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import time
 from typing import Any
 
 import numpy as np
+from keep import keep
 from operations import update_operations
 
 from saclab.protocols import make_config
@@ -67,6 +68,7 @@ def main() -> None:
             times[name].append(milliseconds_per_update(run))
     operations = {name: update_operations(run.config.algorithm, run.replay.layout) for name, run in runs.items()}
     first = ROWS[0][0]
+    keep("growth", operations=operations, milliseconds_per_update=times)
     print("| | operations | ms per update | cost |\n|---|---|---|---|")
     for name, values in times.items():
         cost = statistics.median(value / base for value, base in zip(values, times[first], strict=True))

@@ -13,6 +13,8 @@ import subprocess
 import sys
 import tempfile
 
+from keep import keep
+
 ROWS = [
     ("HalfCheetah-v4", "sac", 1_000),
     ("HalfCheetah-v4", "sac", 200_000),
@@ -55,6 +57,7 @@ MIB = 2**20
 
 def main() -> None:
     print("| | replay, MiB | learner, MiB | peak, MiB | constant, MiB |\n|---|---|---|---|---|")
+    kept = []
     for environment, variant, capacity in ROWS:
         with tempfile.TemporaryDirectory() as folder:
             done = subprocess.run(
@@ -65,6 +68,8 @@ def main() -> None:
         constant = peak - 1.3 * (replay + learner)
         what = f"{environment}, {variant}, {capacity:,}"
         print(f"| {what} | {replay:.0f} | {learner:.0f} | {peak:.0f} | {constant:.0f} |", flush=True)
+        kept.append({"what": what, "replay": replay, "learner": learner, "peak": peak, "constant": constant})
+    keep("memory", mebibytes=kept)
 
 
 if __name__ == "__main__":

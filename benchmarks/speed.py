@@ -22,16 +22,16 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "contestants"))
+from keep import facts  # noqa: E402
 from stopwatch import Job  # noqa: E402
 
 from saclab.comparison.launch import thread_limits  # noqa: E402
-from saclab.training.machine import machine_facts, usable_cores  # noqa: E402
+from saclab.training.machine import usable_cores  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=HERE / "results" / "speed.json")
     options = parser.parse_args()
     cases = [case for case in CASES if options.only in case.name]
-    record: dict[str, Any] = {"date": datetime.now(UTC).isoformat(timespec="minutes"), **machine_facts(), "cases": {}}
-    record["machine"]["cores"] = len(usable_cores())
+    record: dict[str, Any] = {**facts(), "cases": {}}
     for turn in range(options.rounds):
         for case in cases:
             entry = record["cases"].setdefault(case.name, {"rounds": []})

@@ -23,7 +23,7 @@ def speed_table(record: dict[str, Any]) -> str:
     """One row per case and contestant: medians over the rounds, ratios paired within a round."""
     machine, versions = record["machine"], record["versions"]
     lines = [
-        f"{machine['processor']}, {machine['cores']} cores; {record['date'][:10]}; Python {versions['python']}, jax "
+        f"{machine['processor']}, {record['cores']} cores; {record['date'][:10]}; Python {versions['python']}, jax "
         f"{versions['jax']}, mujoco {versions['mujoco']}; {peers_of(record)}. Medians of "
         f"{len(next(iter(record['cases'].values()))['rounds'])} alternating rounds (lowest and highest in brackets).",
         "",

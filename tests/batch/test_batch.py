@@ -20,7 +20,7 @@ from saclab.batch.loop import train_batch
 from saclab.batch.pool import EnvironmentWorkerDied
 from saclab.errors import SettingError, UserError
 from saclab.training import loop, seeds
-from saclab.training.checkpoint import checkpoint_steps
+from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.run import Run
 from saclab.training.run_folder import is_finished, read_run
 

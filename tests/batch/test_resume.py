@@ -11,7 +11,8 @@ from saclab.batch.batch import Batch
 from saclab.batch.loop import train_batch
 from saclab.batch.pool import EnvironmentWorkerDied
 from saclab.training import loop
-from saclab.training.checkpoint import CheckpointError, batch_slots, checkpoint_steps
+from saclab.training.checkpoint import CheckpointError
+from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
 from saclab.training.events import Evaluated, Interrupted, Saved, UpdatesLogged
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished, read_run

@@ -19,7 +19,7 @@ from saclab.comparison.launch import launch
 from saclab.comparison.ray_launch import Cluster
 from saclab.comparison.tasks import RunStatus
 from saclab.errors import UserError
-from saclab.training.checkpoint import checkpoint_steps
+from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.requests import Requests
 
 pytestmark = [

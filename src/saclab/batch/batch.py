@@ -11,8 +11,9 @@ import numpy as np
 
 from saclab.algorithm.numbers import Numbers, numbers_of
 from saclab.algorithm.types import LearnerState
+from saclab.batch.frames import Message
 from saclab.batch.member import Member, MemberReplay, init_settings
-from saclab.batch.pool import EnvironmentPool, Job, error_of
+from saclab.batch.pool import EnvironmentPool, error_of
 from saclab.batch.program import Program
 from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec, environment_spec, make_environment
@@ -305,7 +306,7 @@ def number_arrays(numbers: Numbers) -> Numbers:
     return Numbers(**{name: kinds.get(name, np.float32)(number) for name, number in numbers._asdict().items()})
 
 
-def joined(replies: Sequence[Job]) -> EvaluationEpisodes | RunBroken:
+def joined(replies: Sequence[Message]) -> EvaluationEpisodes | RunBroken:
     """The episodes of one run's test, which came in parts, or what broke in the first of them that did."""
     for header, _ in replies:
         if "failure" in header:

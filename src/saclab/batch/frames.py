@@ -11,6 +11,10 @@ from typing import Any
 import numpy as np
 import safetensors.numpy
 
+from saclab.training.checkpoint import Arrays as Arrays
+
+Message = tuple[dict[str, Any], Arrays]
+
 LENGTHS = struct.Struct("<QQ")
 
 
@@ -23,11 +27,11 @@ def send(pipe: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray] 
         content = content[os.write(pipe, content) :]
 
 
-def receive(pipe: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def receive(pipe: int) -> Message:
     """The next message; raises EOFError if nobody writes any more."""
     text_bytes, blob_bytes = LENGTHS.unpack(read_exactly(pipe, LENGTHS.size))
     header: dict[str, Any] = json.loads(read_exactly(pipe, text_bytes))
-    arrays: dict[str, np.ndarray] = safetensors.numpy.load(read_exactly(pipe, blob_bytes))
+    arrays: Arrays = safetensors.numpy.load(read_exactly(pipe, blob_bytes))
     return header, arrays
 
 

@@ -12,7 +12,8 @@ from saclab.batch.member import Member
 from saclab.config import Config
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
 from saclab.replay import ReplayBuffer
-from saclab.training.checkpoint import common_checkpoints, read_checkpoint
+from saclab.training.checkpoint import read_checkpoint
+from saclab.training.common_checkpoint import common_checkpoints
 from saclab.training.events import Event, Failed, Interrupted, Started
 from saclab.training.journal import Journal, require_same_config, what_is_left
 from saclab.training.lock import locked

@@ -16,6 +16,7 @@ import numpy as np
 
 from saclab.batch import frames
 from saclab.batch.board import Board, Sizes
+from saclab.batch.frames import Arrays, Message
 from saclab.batch.worker import DONE, MESSAGE, STEP
 from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec
@@ -27,8 +28,6 @@ from saclab.training.checkpoint import CheckpointError
 from saclab.training.requests import Stopped
 
 POLL_SECONDS = 0.1
-Arrays = dict[str, np.ndarray]
-Job = tuple[dict[str, Any], Arrays]
 
 
 class EnvironmentWorkerDied(TrainingFailed):
@@ -98,14 +97,14 @@ class EnvironmentPool:
         current: np.ndarray = self.board.observation[self._places(run)].copy()
         return current
 
-    def work_off(self, jobs: Sequence[Job], asked_to_stop: Callable[[], bool]) -> list[Job]:
+    def work_off(self, jobs: Sequence[Message], asked_to_stop: Callable[[], bool]) -> list[Message]:
         """The workers' replies to these messages, each of which goes to whoever is free.
 
         Raises:
             Stopped: when `asked_to_stop`; what the jobs have done so far counts for nothing.
             EnvironmentWorkerDied: if a process is gone.
         """
-        replies: dict[int, Job] = {}
+        replies: dict[int, Message] = {}
         waiting = list(enumerate(jobs))
         busy: dict[PoolWorker, int] = {}
         self.board.stop[0] = False
@@ -222,7 +221,7 @@ class PoolWorker:
         with self.alive():
             frames.send(self.commands, header, arrays)
 
-    def receive(self) -> Job:
+    def receive(self) -> Message:
         with self.alive():
             return frames.receive(self.answers)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from saclab.algorithm.learner import make_learner
 from saclab.batch.board import Board, Sizes
-from saclab.batch.frames import receive, send
+from saclab.batch.frames import Arrays, Message, receive, send
 from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import NonFiniteError, UserError
@@ -27,9 +27,6 @@ from saclab.training.q_bias import Critics, measure_q_bias
 from saclab.training.requests import Stopped
 
 STEP, MESSAGE, DONE = b"s", b"m", b"."
-
-Arrays = dict[str, np.ndarray]
-Reply = tuple[dict[str, Any], Arrays]
 
 
 class Share(NamedTuple):
@@ -58,7 +55,7 @@ class EnvironmentWorker:
         self.spec = self.evaluator.spec
         self.layout = RowLayout(self.spec.observation_size, self.spec.action_size)
 
-    def step(self) -> Reply:
+    def step(self) -> Message:
         """Step every active environment once; what went wrong in which run, and the numbers that belong to it."""
         failures: dict[str, Any] = {}
         arrays: Arrays = {}
@@ -84,7 +81,7 @@ class EnvironmentWorker:
             board.ended[place], board.terminated[place] = True, episode.terminated
             board.total_reward[place], board.length[place] = episode.total_reward, episode.length
 
-    def answer(self, header: dict[str, Any], arrays: Arrays) -> Reply:
+    def answer(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """The answer to a message."""
         match header["do"]:
             case "test":
@@ -98,7 +95,7 @@ class EnvironmentWorker:
                 return self.restore(header, arrays)
         raise ValueError(header["do"])
 
-    def test(self, run: int, test_seeds: list[int], actor: np.ndarray) -> Reply:
+    def test(self, run: int, test_seeds: list[int], actor: np.ndarray) -> Message:
         """One episode of the deterministic policy per seed."""
         policy = self._learner(run).policy
 
@@ -116,7 +113,7 @@ class EnvironmentWorker:
             return {"failure": described(error)}, {}
         return {}, episodes._asdict()
 
-    def q_bias(self, header: dict[str, Any], arrays: Arrays) -> Reply:
+    def q_bias(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """As `Run.q_bias`."""
         config, number = self.configs[header["run"]], header["evaluations"]
         learner = self._learner(header["run"])
@@ -134,7 +131,7 @@ class EnvironmentWorker:
             return {"failure": described(error)}, {}
         return {"bias": list(bias)}, {}
 
-    def restore(self, header: dict[str, Any], arrays: Arrays) -> Reply:
+    def restore(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """Continue the episodes; which environments started anew instead, or why the states do not fit."""
         share = self._share(header["run"])
         try:

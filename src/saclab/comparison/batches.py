@@ -10,7 +10,7 @@ from typing import NamedTuple
 from saclab.algorithm.numbers import Numbers
 from saclab.comparison.grid import Cell
 from saclab.config import Config
-from saclab.training.checkpoint import batch_slots, checkpoint_steps
+from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
 from saclab.training.run_folder import FAILURE
 
 FREE = (

@@ -27,7 +27,7 @@ from saclab.comparison.worker_process import WorkerProcess
 from saclab.config import require
 from saclab.errors import UserError, unknown_name
 from saclab.extras import required
-from saclab.training.checkpoint import checkpoint_steps
+from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.machine import usable_cores
 from saclab.training.requests import Requests
 

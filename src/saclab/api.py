@@ -175,14 +175,19 @@ def compare(
             require_startable(cells, 0, "--workers")  # the memory of its machines is not this one's
             stream = ray_launch.launch(cells, workers, threads, requests, checkpoint_minutes, batch, cluster)
         statuses = (show or last)(stream)
+    return compared(statuses, Path(report) if report else Path(runs) / "report", requests.stop)
+
+
+def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> Comparison:
+    """What came of a grid, with its report in a folder unless the grid was interrupted."""
     failed = {status.cell.folder: status.message for status in statuses if status.status == "failed"}
-    begun = [cell.folder for cell in cells if (cell.folder / "config.json").exists()]
+    begun = [status.cell.folder for status in statuses if (status.cell.folder / "config.json").exists()]
     page = None
-    if begun and not requests.stop:
+    if begun and not interrupted:
         from saclab.comparison.report import write_report
 
-        page = write_report(begun, Path(report) if report else Path(runs) / "report")
-    return Comparison([read_run(folder) for folder in begun], failed, page, requests.stop)
+        page = write_report(begun, report)
+    return Comparison([read_run(folder) for folder in begun], failed, page, interrupted)
 
 
 def chosen_batch(batch: int | None, launcher: str = "local", ray_gpus: float = 0.0) -> int:

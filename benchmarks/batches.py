@@ -28,10 +28,9 @@ import numpy as np
 from keep import keep
 
 from saclab.batch.batch import Batch
-from saclab.comparison.launch import thread_limits
 from saclab.config import Config
+from saclab.machine import thread_limits, usable_cores
 from saclab.protocols import make_config
-from saclab.training.machine import usable_cores
 from saclab.training.process import device_name, prepare_process
 from saclab.training.run import Run
 

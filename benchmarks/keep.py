@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from saclab.training.machine import machine_facts, usable_cores
+from saclab.machine import machine_facts, usable_cores
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -30,8 +30,7 @@ sys.path.insert(0, str(HERE / "contestants"))
 from keep import facts  # noqa: E402
 from stopwatch import Job  # noqa: E402
 
-from saclab.comparison.launch import thread_limits  # noqa: E402
-from saclab.training.machine import usable_cores  # noqa: E402
+from saclab.machine import thread_limits, usable_cores  # noqa: E402
 
 
 @dataclass(frozen=True)

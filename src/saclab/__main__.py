@@ -2,6 +2,6 @@
 
 import sys
 
-from saclab.cli import main
+from saclab.cli.main import main
 
 sys.exit(main())

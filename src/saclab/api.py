@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from saclab.comparison import ray_launch
-from saclab.comparison.grid import Cell, make_grid
-from saclab.comparison.launch import launch
-from saclab.comparison.tasks import RunStatus
 from saclab.config import Config, require
+from saclab.grid import ray
+from saclab.grid.launch import launch
+from saclab.grid.plan import Cell, make_grid
+from saclab.grid.tasks import RunStatus
+from saclab.machine import accelerator, usable_cores
 from saclab.protocols import PROTOCOLS, make_config
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
-from saclab.training.machine import accelerator, usable_cores
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
 
 COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
@@ -144,7 +144,7 @@ def compare(
         runs: the folder that holds all runs; on Ray, one that all machines share.
         report: the report's folder; None for `runs`/report.
         environment_arguments: keyword arguments of every environment.
-        show: consumes the stream of statuses and returns the last ones, such as `saclab.display.show_grid`.
+        show: consumes the stream of statuses and returns the last ones, such as `saclab.cli.display.show_grid`.
         tell: takes what the user should know before it starts.
         checkpoint_minutes: wall-clock time between checkpoints.
         launcher: "local" for processes on this machine, "ray" for a Ray cluster, which needs the extra `ray`.
@@ -162,7 +162,7 @@ def compare(
         overrides = {"acting_delay": 1} | overrides
     cores = len(usable_cores())
     threads = threads or (cores if batch and launcher == "local" else max(1, int(ray_cpus or 1)))
-    cluster = ray_launch.chosen_cluster(launcher, threads, ray_address, ray_cpus, ray_gpus)
+    cluster = ray.chosen_cluster(launcher, threads, ray_address, ray_cpus, ray_gpus)
     cells = plan(environments, variants, seeds, protocol, runs, environment_arguments, overrides)
     if batch:
         tell(batch_note(cells, batch))
@@ -173,7 +173,7 @@ def compare(
             stream = launch(cells, workers, threads, requests, checkpoint_minutes, batch)
         else:
             require_startable(cells, 0, "--workers")  # the memory of its machines is not this one's
-            stream = ray_launch.launch(cells, workers, threads, requests, checkpoint_minutes, batch, cluster)
+            stream = ray.launch(cells, workers, threads, requests, checkpoint_minutes, batch, cluster)
         statuses = (show or last)(stream)
     return compared(statuses, Path(report) if report else Path(runs) / "report", requests.stop)
 
@@ -184,7 +184,7 @@ def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> C
     begun = [status.cell.folder for status in statuses if (status.cell.folder / "config.json").exists()]
     page = None
     if begun and not interrupted:
-        from saclab.comparison.report import write_report
+        from saclab.report.report import write_report
 
         page = write_report(begun, report)
     return Comparison([read_run(folder) for folder in begun], failed, page, interrupted)
@@ -200,7 +200,7 @@ def chosen_batch(batch: int | None, launcher: str = "local", ray_gpus: float = 0
 
 def batch_note(cells: Sequence[Cell], batch: int) -> str:
     """What a user should know of a grid that is trained in batches."""
-    from saclab.comparison.batches import batches
+    from saclab.grid.groups import batches
     from saclab.training.journal import ratio_note
 
     unfinished = [cell for cell in cells if not cell.finished]
@@ -246,7 +246,7 @@ def reproduce(
     Raises:
         UserError: for a name or value that cannot work; nothing has been started then.
     """
-    from saclab.comparison.forecast import forecast_hours
+    from saclab.grid.forecast import forecast_hours
 
     overrides: dict[str, Any] = {"q_bias_episodes": Q_BIAS_EPISODES}
     if updates is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +10,7 @@ from saclab.algorithm.networks import Array
 from saclab.algorithm.types import Batch
 from saclab.environments.vector import Transitions
 from saclab.errors import SettingError
+from saclab.machine import available_memory
 
 
 class RowLayout(NamedTuple):
@@ -117,18 +116,3 @@ def require_memory(
 def replay_bytes(capacity: int, layout: RowLayout) -> int:
     """Memory of a full buffer."""
     return capacity * layout.width * np.dtype(np.float32).itemsize
-
-
-def available_memory() -> int | None:
-    """Bytes that a new process can use, as far as the system says: free memory, or less inside a container."""
-    limits = []
-    meminfo = Path("/proc/meminfo")
-    if meminfo.exists():
-        entries = dict(line.split(":") for line in meminfo.read_text().splitlines())
-        limits.append(int(entries["MemAvailable"].split()[0]) * 1024)
-    elif "SC_AVPHYS_PAGES" in os.sysconf_names:
-        limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
-    if limit.exists() and used.exists() and limit.read_text().strip() != "max":
-        limits.append(int(limit.read_text()) - int(used.read_text()))
-    return min(limits, default=None)

@@ -11,10 +11,10 @@ import shutil
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from comparison.synthetic import write_run
 from playwright.sync_api import expect, sync_playwright
+from report.synthetic import write_run
 
-from saclab.comparison.report import write_report
+from saclab.report.report import write_report
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
@@ -56,7 +56,7 @@ def hostile(tmp_path_factory):
 
 def write_page(runs, out):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("saclab.comparison.report.write_figures", lambda *_: None)  # their making is tested elsewhere
+        patch.setattr("saclab.report.report.write_figures", lambda *_: None)  # their making is tested elsewhere
         return write_report(runs, out)
 
 

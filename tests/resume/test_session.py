@@ -18,11 +18,11 @@ from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from saclab.environments.make import make_environment
 from saclab.environments.simulator import capture_mujoco, capture_state, restore_mujoco
 from saclab.errors import UserError
+from saclab.machine import machine_facts, visible_threads
 from saclab.training import loop
 from saclab.training.checkpoint import CheckpointError, newest_first
 from saclab.training.events import Saved, Started, Warned
 from saclab.training.lock import locked
-from saclab.training.machine import machine_facts, visible_threads
 
 from .helpers import finish, lines_of, small_config, stop_at
 from .stage import SECOND, newest, sign

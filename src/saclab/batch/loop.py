@@ -11,6 +11,7 @@ from saclab.batch.batch import Batch
 from saclab.batch.member import Member
 from saclab.config import Config
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
+from saclab.machine import machine_facts, usable_cores
 from saclab.replay import ReplayBuffer
 from saclab.training.checkpoint import read_checkpoint
 from saclab.training.common_checkpoint import common_checkpoints
@@ -18,7 +19,6 @@ from saclab.training.events import Event, Failed, Interrupted, Started
 from saclab.training.journal import Journal, require_same_config, what_is_left
 from saclab.training.lock import locked
 from saclab.training.loop import EVALUATE_FIRST, PROGRESS_SECONDS
-from saclab.training.machine import machine_facts, usable_cores
 from saclab.training.process import device_name, prepare_process
 from saclab.training.requests import Requests, Stopped
 from saclab.training.run_folder import is_finished

@@ -29,7 +29,8 @@ import safetensors.numpy
 
 from saclab.errors import TrainingFailed
 from saclab.files import sync, write_bytes
-from saclab.replay import ReplayBuffer, available_memory
+from saclab.machine import available_memory
+from saclab.replay import ReplayBuffer
 
 FORMAT = 1
 KEPT = 2

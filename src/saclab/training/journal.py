@@ -15,6 +15,7 @@ from saclab.config import Config
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken, UserError
 from saclab.files import write_json
+from saclab.machine import different_facts
 from saclab.trained_policy import save_policy
 from saclab.training.captured import part, plain_numbers
 from saclab.training.checkpoint import Checkpoint, CheckpointError, newest_first, save_checkpoint
@@ -22,7 +23,6 @@ from saclab.training.course import Course
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.events import EpisodeEnded, Evaluated, Event, Finished, Progress, Saved, UpdatesLogged, Warned
 from saclab.training.failure import write_failure
-from saclab.training.machine import different_facts
 from saclab.training.q_bias import QBias
 from saclab.training.run_folder import FORMAT, Logs, append_line, read_config
 

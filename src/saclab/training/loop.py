@@ -9,11 +9,11 @@ from pathlib import Path
 
 from saclab.config import Config
 from saclab.errors import NonFiniteError, TrainingFailed
+from saclab.machine import machine_facts
 from saclab.training.checkpoint import load_newest_checkpoint
 from saclab.training.events import Evaluated, Event, Interrupted, Saved, Started
 from saclab.training.journal import Journal, require_same_config, what_is_left
 from saclab.training.lock import locked
-from saclab.training.machine import machine_facts
 from saclab.training.process import device_name, prepare_process
 from saclab.training.requests import Requests, Stopped
 from saclab.training.run import Run

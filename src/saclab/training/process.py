@@ -13,7 +13,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version as jaxlib_version
 
-from saclab.training.machine import accelerator_plugins, processor_features, visible_threads
+from saclab.machine import accelerator_plugins, processor_features, visible_threads
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 KEPT_BYTES = 2**28  # larger blocks, such as most replay buffers, still come from the system and go back to it

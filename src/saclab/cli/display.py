@@ -1,0 +1,182 @@
+"""What the terminal shows while runs go on: live bars on a terminal, plain lines in a file or a pipe."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.table import Table
+
+from saclab.api import Comparison
+from saclab.config import TrainingSettings
+from saclab.grid.tasks import RunStatus
+from saclab.signals import EXIT_STATUS
+from saclab.training import events
+
+PLAIN_SECONDS = 20  # between two lines of a grid's progress that goes to a file or a pipe
+
+
+def duration(seconds: float | None) -> str:
+    """1:02:03, or a dash if it is not known."""
+    if seconds is None:
+        return "–"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}"
+
+
+def number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1f}"
+
+
+class RateMeter:
+    """Updates per second and time left since the first update of this session."""
+
+    def __init__(self) -> None:
+        self.began: events.Progress | None = None
+        self.rate = 0.0
+        self.seconds_left: float | None = None
+
+    def enter(self, progress: events.Progress) -> None:
+        if self.began is None:
+            self.began = progress if progress.updates > 0 else None
+            return
+        seconds, share = progress.seconds - self.began.seconds, progress.fraction - self.began.fraction
+        if seconds > 0 and share > 0:
+            self.rate = (progress.updates - self.began.updates) / seconds
+            self.seconds_left = (1 - progress.fraction) * seconds / share
+
+
+def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[events.Event]:
+    """Pass a run's events on, and show them: a bar with rate and time left, one line per test."""
+    columns = (BarColumn(bar_width=30), TaskProgressColumn(), TextColumn("{task.description}"))
+    meter, test_return = RateMeter(), None
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("random steps", total=1.0)
+        for event in stream:
+            match event:
+                case events.Started():
+                    where = f"resumed at step {event.resumed_at_step}" if event.resumed_at_step else "started"
+                    console.print(f"{escape(str(event.run))} {where}")
+                    for note in event.notes:
+                        console.print(f"  {escape(note)}", soft_wrap=True)
+                case events.Progress():
+                    meter.enter(event)
+                    bar.update(task, completed=event.fraction, description=(
+                        f"step {event.steps:,} · update {event.updates:,} · {meter.rate:.0f} updates/s · "
+                        f"{duration(meter.seconds_left)} left · test return {number(test_return)}"
+                    ))  # fmt: skip
+                case events.Evaluated():
+                    test_return = float(event.total_rewards.mean())
+                    spread = float(event.total_rewards.std())
+                    console.print(
+                        f"step {event.steps:>9,}  update {event.updates:>9,}  episode {event.episodes:>6,}  "
+                        f"test return {test_return:9.1f} ± {spread:.1f} over {len(event.total_rewards)}"
+                        + ("  best" if event.best else "")
+                        + f"  ({meter.rate:.0f} updates/s, {duration(meter.seconds_left)} left)",
+                        soft_wrap=True,
+                    )
+                case events.Warned():
+                    console.print(f"warning: {escape(event.message)}", soft_wrap=True)
+                case events.Finished():
+                    console.print(
+                        f"finished: {event.reason}; {event.steps:,} steps, {event.updates:,} updates, "
+                        f"{event.episodes:,} episodes; best test return {event.best_return:.1f}, "
+                        f"last {event.final_return:.1f}",
+                        soft_wrap=True,
+                    )
+            yield event
+
+
+def show_grid(stream: Iterable[Sequence[RunStatus]], console: Console) -> list[RunStatus]:
+    """Show a grid of runs until its end; the last statuses."""
+    statuses: Sequence[RunStatus] = ()
+    last_line = 0.0
+    with Live(console=console, refresh_per_second=4, transient=True, auto_refresh=console.is_terminal) as live:
+        for statuses in stream:
+            if console.is_terminal:
+                live.update(grid_table(statuses, rows=max(5, console.height - 6)))
+            elif time.monotonic() - last_line > PLAIN_SECONDS:
+                last_line = time.monotonic()
+                console.print(grid_line(statuses), soft_wrap=True)
+    console.print(grid_table(statuses, rows=len(statuses)))
+    for status in statuses:
+        for warning in status.warnings:
+            console.print(f"warning: {run_name(status)}: {warning}", markup=False, soft_wrap=True)
+    return list(statuses)
+
+
+def run_name(status: RunStatus) -> str:
+    config = status.cell.config
+    return f"{config.environment} {config.variant} seed {config.seed}"
+
+
+def grid_line(statuses: Sequence[RunStatus]) -> str:
+    """One plain line: how many runs are done, and where the running ones are."""
+    finished = sum(status.status == "finished" for status in statuses)
+    running = [
+        f"{run_name(status)}: {status.fraction:.0%}, {status.updates_per_second:.0f} updates/s, "
+        f"{duration(status.seconds_left)} left, test return {number(status.test_return)}"
+        for status in statuses
+        if status.status == "running"
+    ]
+    return escape(f"{finished} of {len(statuses)} runs finished | " + " | ".join(running))
+
+
+def grid_table(statuses: Sequence[RunStatus], rows: int) -> Table:
+    """One line per run, the running ones first where not all fit."""
+    table = Table(box=None, header_style="bold")
+    table.add_column("run", overflow="fold")
+    for title in ("state", "done", "updates/s", "left", "test return"):
+        table.add_column(title, justify="right", no_wrap=True)
+    order = {"running": 0, "failed": 1, "waiting": 2, "interrupted": 2, "finished": 3}
+    shown = statuses if len(statuses) <= rows else sorted(statuses, key=lambda status: order[status.status])[:rows]
+    colours = {"failed": "red", "running": "cyan", "finished": "green"}
+    for status in shown:
+        table.add_row(
+            escape(run_name(status)), f"[{colours.get(status.status, 'default')}]{status.status}[/]",
+            f"{status.fraction:.0%}", f"{status.updates_per_second:.0f}", duration(status.seconds_left),
+            number(status.test_return),
+        )  # fmt: skip
+    if len(shown) < len(statuses):
+        table.add_row(f"… and {len(statuses) - len(shown)} more")
+    return table
+
+
+def show_comparison(result: Comparison, console: Console) -> int:
+    """Say what failed and where the report lies; the exit status."""
+    for folder, message in result.failed.items():
+        console.print(f"failed: {folder}: {message}", markup=False, soft_wrap=True)
+    if result.interrupted:
+        console.print("saved; the same command continues where it stopped")
+        return EXIT_STATUS.get(result.interrupted, 1)
+    if result.report:
+        cells = [(run.config.environment, run.config.variant) for run in result.runs]
+        if len({variant for _, variant in cells}) > 1 and len(set(cells)) == len(cells):
+            from saclab.report.scores import ONE_SEED  # the table above looks like a ranking, and is none
+
+            console.print(ONE_SEED, highlight=False, soft_wrap=True)
+        console.print(f"report: {result.report.resolve()}", markup=False, soft_wrap=True)
+    return 1 if result.failed else 0
+
+
+def catalogue(rows: Mapping[str, tuple[str, Mapping[str, Any]]]) -> Table:
+    """Names with their description and settings."""
+    table = Table(box=None, show_header=False, padding=(0, 2, 1, 0))
+    for name, (description, settings) in rows.items():
+        listed = ", ".join(f"{key} {value}" for key, value in settings.items())
+        table.add_row(
+            f"[bold]{escape(name)}[/]", escape(description) + (f"\n[dim]{escape(listed)}[/]" if listed else "")
+        )
+    return table
+
+
+def changed_settings(settings: TrainingSettings) -> dict[str, Any]:
+    """The settings of a protocol that are set."""
+    return {name: value for name, value in dataclasses.asdict(settings).items() if value is not None}

@@ -1,0 +1,155 @@
+"""How long a grid will take, from a few measured updates of each kind of run on this machine."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from typing import NamedTuple
+
+from saclab.config import Config
+from saclab.grid.plan import Cell
+from saclab.grid.tasks import make_statuses, make_tasks
+from saclab.machine import thread_limits
+
+WARM_UPDATES, MEASURED_UPDATES = 5, 40
+
+
+class Cost(NamedTuple):
+    """Seconds, measured."""
+
+    per_update: float
+    """With the environment steps that belong to it."""
+    per_step: float
+    """One environment step alone."""
+
+
+class Kind(NamedTuple):
+    """What is measured: a run, or several as one batch."""
+
+    configs: tuple[Config, ...]
+    slots: int
+    """Of the batch; 0 for a run alone."""
+    workers: int
+    """Processes that step the environments of a batch."""
+
+
+def forecast_hours(cells: Sequence[Cell], workers: int, threads: int, batch: int = 0) -> float:
+    """Hours until every unfinished cell is at its limits, if all goes on as a few updates of each kind did.
+
+    Args:
+        cells: the grid.
+        workers: as `launch.launch` takes it.
+        threads: as `launch.launch` takes it.
+        batch: as `launch.launch` takes it.
+
+    Raises:
+        UserError: if an environment cannot be made.
+    """
+    tasks = make_tasks(make_statuses(cells), batch)
+    kinds: dict[object, Kind] = {}
+    names = []
+    for task in tasks:
+        configs = tuple(run.cell.config for run in task.runs)
+        names.append((configs[0].environment, task.slots, *sorted({config.variant for config in configs})))
+        kinds.setdefault(names[-1], Kind(configs, task.slots, workers))
+    costs = dict(zip(kinds, measure_in_process([*kinds.values()], threads), strict=True))
+    seconds = [
+        max(run_seconds(run.cell.config, costs[name]) for run in task.runs)
+        for task, name in zip(tasks, names, strict=True)
+    ]
+    longest = max(seconds, default=0.0)
+    return max(sum(seconds) / (1 if batch else workers), longest) / 3600
+
+
+def run_seconds(config: Config, cost: Cost) -> float:
+    """Seconds of a run that goes to its nearest limit of steps or updates, its tests counted in."""
+    training = config.training
+    limits = []
+    if training.max_updates is not None:
+        limits.append(training.random_steps + training.max_updates / training.update_to_data_ratio)
+    if training.max_steps is not None:
+        limits.append(training.max_steps)
+    if training.max_episodes is not None:
+        limits.append(training.random_steps + training.max_episodes * 1000)
+    steps = min(limits)
+    updates = training.updates_due(int(steps))
+    if training.evaluation_interval_episodes is not None:
+        # test episodes are about as long as training episodes, so their number says how many steps they cost
+        tested = steps * training.evaluation_episodes / training.evaluation_interval_episodes
+    else:
+        assert training.evaluation_interval_steps is not None
+        tested = steps / training.evaluation_interval_steps * training.evaluation_episodes * 1000
+    return updates * cost.per_update + (training.random_steps + tested) * cost.per_step
+
+
+def measure_in_process(kinds: Sequence[Kind], threads: int) -> list[Cost]:
+    """Measure each kind one after the other, in a process with as many threads as a worker has."""
+    described = [([config.to_dict() for config in kind.configs], kind.slots, kind.workers) for kind in kinds]
+    process = subprocess.run(
+        [sys.executable, "-m", "saclab.grid.forecast"],
+        input=json.dumps(described).encode(),
+        stdout=subprocess.PIPE,
+        check=True,
+        env=os.environ | thread_limits(threads),
+    )
+    return [Cost(*values) for values in json.loads(process.stdout)]
+
+
+def measure(kind: Kind) -> Cost:
+    """Train for a moment: nothing is written. Of a batch, an update is one of all its runs."""
+    import numpy as np
+
+    from saclab.batch.batch import Batch
+    from saclab.training.course import Course
+    from saclab.training.process import prepare_process
+    from saclab.training.run import Run
+
+    prepare_process()
+    configs = [endless(config) for config in kind.configs]
+    trained: Run | Batch
+    if kind.slots:
+        trained = Batch(configs, kind.slots, kind.workers)
+        trained.begin()
+        run: Course = trained.members[0]
+    else:
+        trained = run = Run(configs[0])
+    counters, random_steps = run.counters, run.config.training.random_steps
+    with closing(trained):
+        began = time.perf_counter()
+        while counters.steps < random_steps:
+            trained.step()
+        per_step = (time.perf_counter() - began) / counters.steps
+        while counters.updates < WARM_UPDATES:
+            trained.step()
+        np.array(run.actor)  # waits for the updates
+        began, first = time.perf_counter(), counters.updates
+        while counters.updates < first + MEASURED_UPDATES:
+            trained.step()
+        np.array(run.actor)
+        return Cost((time.perf_counter() - began) / (counters.updates - first), per_step)
+
+
+def endless(config: Config) -> Config:
+    """The same run with the shortest random phase and no end."""
+    training = dataclasses.replace(
+        config.training, random_steps=config.algorithm.batch_size, max_updates=None, max_steps=sys.maxsize
+    )
+    return dataclasses.replace(config, training=training)
+
+
+def main() -> None:
+    kinds = [
+        Kind(tuple(Config.from_dict(config) for config in configs), slots, workers)
+        for configs, slots, workers in json.load(sys.stdin)
+    ]
+    print(json.dumps([measure(kind) for kind in kinds]))
+
+
+if __name__ == "__main__":
+    main()

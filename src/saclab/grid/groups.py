@@ -1,0 +1,77 @@
+"""Which runs of a grid are trained together as one batch."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from saclab.algorithm.numbers import Numbers
+from saclab.config import Config
+from saclab.grid.plan import Cell
+from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
+from saclab.training.run_folder import FAILURE
+
+FREE = (
+    "max_steps", "max_episodes", "patience_episodes", "evaluation_interval_episodes",
+    "evaluation_interval_steps", "evaluation_episodes", "q_bias_episodes", "log_interval",
+)  # fmt: skip
+"""Settings of training in which the runs of a batch may differ: they decide nothing of a step."""
+NO_CHECKPOINT = -1  # in place of a step: one of step 0 is something else
+
+
+class Group(NamedTuple):
+    """Runs that make one batch."""
+
+    members: list[int]
+    """Their places in the sequence that was given."""
+    slots: int
+    """Of the batch: as many as runs, or as the batch had from which they are continued."""
+
+
+def structure(config: Config) -> str:
+    """What the runs of a batch have in common: everything but the seed, plain numbers and when a run is tested."""
+    algorithm = {
+        name: value
+        for name, value in dataclasses.asdict(config.algorithm).items()
+        if name not in (*Numbers._fields, "temperature", "initial_temperature")
+    }
+    training = {name: value for name, value in dataclasses.asdict(config.training).items() if name not in FREE}
+    return json.dumps([config.environment, config.environment_arguments, algorithm, training], sort_keys=True)
+
+
+def batches(cells: Sequence[Cell], size: int) -> list[Group]:
+    """Groups of at most `size` unfinished cells of the same structure that have come equally far, in their order."""
+    kinds: dict[str, list[int]] = {}
+    for index, cell in enumerate(cells):
+        kinds.setdefault(structure(cell.config), []).append(index)
+    groups = []
+    for members in kinds.values():
+        for equally_far in by_progress(cells, members):
+            parts = [equally_far[first : first + size] for first in range(0, len(equally_far), size)]
+            groups += [Group(part, max(len(part), min(size, slots_before(cells, part)))) for part in parts]
+    return sorted(groups, key=lambda group: group.members)
+
+
+def by_progress(cells: Sequence[Cell], members: Sequence[int]) -> list[list[int]]:
+    """Parts that have a checkpoint of the same step, or none at all; the runs of a batch are always equally far.
+
+    A process that was killed while it saved leaves the newest checkpoint in some of its runs only; the one before
+    is in all of them, as two are kept. A run that has failed would only hold up the others, or fail with them again.
+    """
+    parts = []
+    for failed in (False, True):
+        chosen = [index for index in members if (cells[index].folder / FAILURE).exists() == failed]
+        steps = {index: checkpoint_steps(cells[index].folder) or [NO_CHECKPOINT] for index in chosen}
+        while steps:
+            common = min(found[0] for found in steps.values())
+            part = [index for index, found in steps.items() if common in found]
+            parts.append(part)
+            steps = {index: found for index, found in steps.items() if index not in part}
+    return parts
+
+
+def slots_before(cells: Sequence[Cell], members: Sequence[int]) -> int:
+    """Slots of the batch in which these runs were last; 0 if they were in none."""
+    return max(batch_slots(cells[index].folder) for index in members)

@@ -1,0 +1,137 @@
+"""What one worker process trains, and what is known of it while it does: the part that every launcher shares."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from saclab.grid.groups import batches
+from saclab.grid.plan import Cell
+
+Status = Literal["waiting", "running", "finished", "interrupted", "failed"]
+ERROR_LINES = 30  # of a crashed worker's standard error, looked through for its last words
+
+
+@dataclass
+class RunStatus:
+    """What is known of a run of the grid while it goes on."""
+
+    cell: Cell
+    status: Status = "waiting"
+    fraction: float = 0.0
+    updates: int = 0
+    episodes: int = 0
+    updates_per_second: float = 0.0
+    seconds_left: float | None = None
+    test_return: float | None = None
+    message: str = ""
+    """Why it failed."""
+    warnings: list[str] = field(default_factory=list)
+    """What the run said of itself that the user should know."""
+    first_progress: tuple[float, float, int] | None = field(default=None, repr=False)
+    """Clock, fraction and updates when this session's first update had been made: compilation is not in the rate."""
+
+    def enter(self, message: dict[str, object]) -> None:
+        """Take in one line of the worker."""
+        match message:
+            case {"event": "progress", "fraction": float(fraction), "updates": int(updates), "episodes": int(episodes)}:
+                self.fraction, self.updates, self.episodes = fraction, updates, episodes
+                self._measure_rate(time.monotonic())
+            case {"event": "evaluated", "mean_return": float(mean)}:
+                self.test_return = mean
+            case {"event": "warned", "message": str(text)}:
+                self.warnings.append(text)
+            case {"event": "finished"}:
+                self.status, self.fraction = "finished", 1.0
+            case {"event": "interrupted"}:
+                self.status = "interrupted"
+            case {"event": "failed", "message": str(text)}:
+                self.status, self.message = "failed", text
+
+    def lose_worker(self, why: str) -> None:
+        """Wait for another worker, which goes on from the last checkpoint."""
+        self.warnings.append(f"its worker was lost ({why}): continued from the last checkpoint")
+        self.status, self.first_progress, self.updates_per_second, self.seconds_left = "waiting", None, 0.0, None
+
+    def _measure_rate(self, now: float) -> None:
+        if self.first_progress is None:
+            if self.updates > 0:
+                self.first_progress = (now, self.fraction, self.updates)
+            return
+        began, fraction, updates = self.first_progress
+        if now > began and self.fraction > fraction:
+            self.updates_per_second = (self.updates - updates) / (now - began)
+            self.seconds_left = (1 - self.fraction) * (now - began) / (self.fraction - fraction)
+
+
+@dataclass
+class Task:
+    """A run alone, or runs that are trained as one batch."""
+
+    runs: list[RunStatus]
+    slots: int
+    """Of the batch, at least as many as runs; 0 for a run alone."""
+
+    def start(self) -> None:
+        for run in self.runs:
+            run.status = "running"
+
+    def to_dict(
+        self, checkpoint_minutes: float, cores: Sequence[int] = (), workers: int = 1, patience: float = 0
+    ) -> dict[str, Any]:
+        """What `saclab.grid.worker` takes on its standard input.
+
+        Args:
+            checkpoint_minutes: wall-clock time between checkpoints.
+            cores: it keeps to these; none leaves them to the system.
+            workers: of a batch, the processes that step environments.
+            patience: seconds that it waits for a run folder that is in use.
+        """
+        runs = [{"config": run.cell.config.to_dict(), "folder": str(run.cell.folder.absolute())} for run in self.runs]
+        return {
+            "runs": runs,
+            "slots": self.slots,
+            "workers": workers,
+            "checkpoint_minutes": checkpoint_minutes,
+            "cores": list(cores),
+            "patience": patience,
+        }
+
+    def enter(self, message: dict[str, Any]) -> None:
+        """Take in one line of the worker, which says of which run it speaks."""
+        self.runs[message["run"]].enter(message)
+
+    def ended(self, code: int, stopping: bool, errors: str) -> None:
+        """Note how the process ended; a worker that said nothing of a run's end has failed it.
+
+        One that was told to stop before it could listen, while it was still importing, has lost nothing.
+        """
+        last_lines = [line for line in errors.splitlines() if line.strip()][-ERROR_LINES:]
+        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+        for run in self.runs:
+            if run.status != "running":
+                continue
+            if code == 0:
+                run.status, run.fraction = "finished", 1.0
+            elif stopping and code == -signal.SIGTERM:
+                run.status = "interrupted"
+            else:
+                run.status = "failed"
+                run.message = f"worker ended with {how}" + (f": {last_lines[-1]}" if last_lines else "")
+
+
+def make_statuses(cells: Sequence[Cell]) -> list[RunStatus]:
+    """One per run of the grid."""
+    return [RunStatus(cell, "finished", 1.0) if cell.finished else RunStatus(cell) for cell in cells]
+
+
+def make_tasks(statuses: Sequence[RunStatus], batch: int) -> list[Task]:
+    """The unfinished runs, each alone, or up to `batch` of the same structure together; in the grid's order."""
+    waiting = [status for status in statuses if status.status == "waiting"]
+    if batch == 0:
+        return [Task([status], 0) for status in waiting]
+    groups = batches([status.cell for status in waiting], batch)
+    return [Task([waiting[index] for index in group.members], group.slots) for group in groups]

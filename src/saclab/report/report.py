@@ -1,0 +1,47 @@
+"""The report of a comparison: a page, figures, and tables for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from saclab.report.curves import gather_curves
+from saclab.report.figures import write_figures
+from saclab.report.page import make_page
+from saclab.report.runs import all_notices, read_comparison
+from saclab.report.scores import aggregate, score_environment
+from saclab.report.tables import latex, markdown, scores_csv
+
+
+def write_report(runs: Sequence[Path], out: Path, allow_mixed: bool = False) -> Path:
+    """Compare runs and write index.html, report.md, scores.csv, table.tex and figures/*.png, *.svg into `out`.
+
+    Runs may be unfinished, or have no test yet; the report says so.
+
+    Args:
+        runs: run folders.
+        out: folder of the report; made if it is missing, files of an earlier report are replaced.
+        allow_mixed: show runs that are not comparable side by side, in place of refusing.
+
+    Returns:
+        The path of index.html, one self-contained page.
+
+    Raises:
+        UserError: for a folder that is not a run, runs that are not comparable, or two runs of one experiment and
+            seed.
+    """
+    comparison = read_comparison(runs, allow_mixed)
+    scores = [score_environment(comparison, environment) for environment in comparison.environments]
+    together = aggregate(scores)
+    curves = gather_curves(comparison)
+    warnings = [*all_notices(comparison), *(f"Mixed on request: {difference}" for difference in comparison.mixed)]
+    out.mkdir(parents=True, exist_ok=True)
+    write_figures(comparison, scores, together, curves, out / "figures")
+    for name, text in {
+        "report.md": markdown(comparison, scores, warnings),
+        "scores.csv": scores_csv(comparison, scores),
+        "table.tex": latex(scores, warnings),
+        "index.html": make_page(comparison, scores, together, curves, warnings),
+    }.items():
+        (out / name).write_text(text, encoding="utf-8")
+    return out / "index.html"

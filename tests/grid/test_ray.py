@@ -1,0 +1,234 @@
+"""A grid on a real Ray cluster of this machine: the bits of local workers, whatever is killed or stopped on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from resume.helpers import assert_same_run, lines_of, run, start, wait_for
+
+from saclab.errors import UserError
+from saclab.grid import ray
+from saclab.grid.launch import launch
+from saclab.grid.plan import Cell, make_grid
+from saclab.grid.ray import Cluster
+from saclab.grid.tasks import RunStatus
+from saclab.training.common_checkpoint import checkpoint_steps
+from saclab.training.requests import Requests
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install 'saclab[ray]'"),
+]
+
+VARIANTS = ("sac", "averaged-auto")
+OFTEN = 0.005  # minutes: every 0.3 s
+HERE = Cluster("local")  # a cluster of its own, whatever runs on this machine
+SETTINGS = {
+    "hidden_layers": (8,), "batch_size": 16, "random_steps": 100, "update_interval": 1, "replay_capacity": 1000,
+    "evaluation_interval_steps": 2500, "evaluation_episodes": 1, "max_updates": 9000,
+}  # fmt: skip
+WORDS = (
+    "compare", "Pendulum-v1", "--variants", *VARIANTS, "--protocol", "quick", "--seeds", "1",
+    "--checkpoint-minutes", str(OFTEN), *(
+        str(word) for name, value in SETTINGS.items()
+        for word in ("--" + name.replace("_", "-"), *(value if isinstance(value, tuple) else (value,)))
+    ),
+)  # fmt: skip
+ON_RAY = ("--launcher", "ray", "--ray-address", "local")
+
+
+def grid(runs: Path) -> list[Cell]:
+    return make_grid(["Pendulum-v1"], VARIANTS, "quick", [0], runs, overrides=SETTINGS)
+
+
+def on_ray(cells: list[Cell], requests: Requests | None = None) -> Iterator[list[RunStatus]]:
+    return ray.launch(cells, None, 1, requests or Requests(), OFTEN, cluster=HERE)
+
+
+def finish_locally(cells: list[Cell]) -> list[RunStatus]:
+    *_, statuses = launch(cells, workers=2, threads=1, requests=Requests(), checkpoint_minutes=OFTEN)
+    assert {status.status for status in statuses} == {"finished"}
+    return statuses
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> list[Cell]:
+    """The grid, trained by local workers without a break."""
+    cells = grid(tmp_path_factory.mktemp("straight"))
+    finish_locally(cells)
+    return cells
+
+
+def assert_same_grid(cells: list[Cell], straight: list[Cell]) -> None:
+    for ours, theirs in zip(cells, straight, strict=True):
+        assert_same_run(ours.folder, theirs.folder)
+
+
+def sessions(cell: Cell) -> list[dict]:
+    return lines_of(cell.folder / "sessions.jsonl")
+
+
+def status_of(process: int) -> tuple[str, int]:
+    """State and parent of a process; ("X", 0) if there is none."""
+    try:
+        state, parent = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[:2]
+    except OSError:
+        return "X", 0
+    return state, int(parent)
+
+
+def is_dead(process: int) -> bool:
+    return status_of(process)[0] in "XZ"
+
+
+def trained_a_while(cell: Cell) -> bool:
+    return any(step > 1000 for step in checkpoint_steps(cell.folder))
+
+
+def ray_process(worker: int) -> int:
+    return status_of(worker)[1]
+
+
+def kill_worker(cell: Cell, victim: Callable[[int], int]) -> None:
+    """`kill -9` on the victim, which must be the end of the worker too, before anyone could start another.
+
+    The worker is asleep, so that it cannot notice by itself that nobody listens any more.
+    """
+    worker = sessions(cell)[-1]["process"]
+    os.kill(worker, signal.SIGSTOP)
+    os.kill(victim(worker), signal.SIGKILL)
+    wait_for(lambda: is_dead(worker), seconds=1)
+
+
+def test_a_grid_whose_processes_are_killed_ends_with_the_bits_of_local_workers(tmp_path, straight, capfd):
+    cells = grid(tmp_path)
+    victims = {cells[0].folder: ray_process, cells[1].folder: lambda worker: worker}
+    statuses: list[RunStatus] = []
+    for statuses in on_ray(cells):  # noqa: B007 - the last ones are looked at
+        for cell in cells:
+            if cell.folder in victims and trained_a_while(cell):
+                kill_worker(cell, victims.pop(cell.folder))
+    assert [status.status for status in statuses] == ["finished", "finished"]
+    assert [len(status.warnings) for status in statuses] == [1, 1]
+    assert "worker was lost (ActorDiedError: " in statuses[0].warnings[0]
+    assert "worker was lost (it was killed)" in statuses[1].warnings[0]
+    for cell in cells:
+        assert [line["from_step"] > 1000 for line in sessions(cell)] == [False, True]
+    assert capfd.readouterr() == ("", ""), "Ray has said nothing"
+    assert_same_grid(cells, straight)
+
+
+def test_a_batch_whose_process_is_killed_ends_with_the_bits_of_a_local_batch(tmp_path):
+    """Its environments' processes end with it."""
+    settings = {**SETTINGS, "max_updates": 6000, "acting_delay": 1}
+    here, there = (
+        make_grid(["Pendulum-v1"], ["sac", "sac-auto"], "quick", [0], tmp_path / name, overrides=settings)
+        for name in ("local", "ray")
+    )
+    *_, statuses = launch(here, workers=1, threads=1, requests=Requests(), checkpoint_minutes=OFTEN, batch=2)
+    assert {status.status for status in statuses} == {"finished"}
+    killed = False
+    for statuses in ray.launch(there, None, 1, Requests(), OFTEN, 2, HERE):  # noqa: B007
+        if not killed and all(trained_a_while(cell) for cell in there):
+            killed = True
+            kill_worker(there[0], ray_process)
+    assert [status.status for status in statuses] == ["finished", "finished"]
+    assert [len(status.warnings) for status in statuses] == [1, 1]
+    assert_same_grid(there, here)
+
+
+def test_a_grid_that_is_stopped_on_ray_is_finished_by_local_workers_to_the_same_bits(tmp_path, straight):
+    cells, requests = grid(tmp_path), Requests()
+    statuses: list[RunStatus] = []
+    for statuses in on_ray(cells, requests):  # noqa: B007 - the last ones are looked at
+        if all(trained_a_while(cell) for cell in cells):
+            requests.stop = 1
+    assert [status.status for status in statuses] == ["interrupted", "interrupted"]
+    assert all(is_dead(sessions(cell)[-1]["process"]) for cell in cells)
+    finish_locally(cells)
+    assert all(sessions(cell)[-1]["from_step"] > 1000 for cell in cells)
+    assert_same_grid(cells, straight)
+
+
+def test_a_grid_that_is_dropped_saves_and_leaves_no_process_behind(tmp_path):
+    cells = grid(tmp_path)
+    stream = on_ray(cells)
+    while not all(trained_a_while(cell) for cell in cells):
+        next(stream)
+    workers = [sessions(cell)[-1]["process"] for cell in cells]
+    ray_processes = list(map(ray_process, workers))
+    seen = [checkpoint_steps(cell.folder)[0] for cell in cells]
+    stream.close()
+    assert all(map(is_dead, workers))
+    assert all(checkpoint_steps(cell.folder)[0] > step for cell, step in zip(cells, seen, strict=True))
+    wait_for(lambda: all(map(is_dead, ray_processes)), seconds=20)
+
+
+def test_the_run_of_a_lost_machine_goes_on_at_another(tmp_path, straight):
+    from ray.cluster_utils import Cluster as Machines
+
+    machines = Machines(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        second = machines.add_node(num_cpus=1)
+        cells, statuses = grid(tmp_path), []
+        cluster = Cluster(machines.address)
+        for statuses in ray.launch(cells, None, 1, Requests(), OFTEN, cluster=cluster):  # noqa: B007
+            if second is not None and all(trained_a_while(cell) for cell in cells):
+                machines.remove_node(second, allow_graceful=False)
+                second = None
+        assert [status.status for status in statuses] == ["finished", "finished"]
+        assert sorted(len(status.warnings) for status in statuses) == [0, 1]
+        assert sorted(len(sessions(cell)) for cell in cells) == [1, 2]
+        assert_same_grid(cells, straight)
+    finally:
+        machines.shutdown()
+
+
+def compare_on_ray(folder: Path) -> tuple[subprocess.Popen[str], list[int]]:
+    """`saclab compare` once both runs have trained a while, and its workers."""
+    process, cells = start(folder, *WORDS, *ON_RAY), grid(folder / "runs")
+    wait_for(lambda: process.poll() is not None or all(trained_a_while(cell) for cell in cells))
+    assert process.poll() is None, process.communicate()
+    return process, [sessions(cell)[-1]["process"] for cell in cells]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_saves_on_a_signal_and_says_nothing_of_rays(tmp_path, straight, number):
+    process, workers = compare_on_ray(tmp_path)
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, output
+    assert output.count("interrupted") == 2
+    assert output.splitlines()[-1] == "saved; the same command continues where it stopped"
+    assert "ray" not in output.lower()
+    assert all(map(is_dead, workers))
+    run(tmp_path, *WORDS, *ON_RAY)
+    assert_same_grid(grid(tmp_path / "runs"), straight)
+
+
+def test_nothing_writes_on_once_the_command_is_killed(tmp_path, straight):
+    process, workers = compare_on_ray(tmp_path)
+    process.kill()
+    process.communicate(timeout=60)
+    wait_for(lambda: all(map(is_dead, workers)), seconds=60)
+    run(tmp_path, *WORDS)
+    assert_same_grid(grid(tmp_path / "runs"), straight)
+
+
+def test_a_cluster_that_is_not_there_or_too_small_is_a_users_error(tmp_path):
+    began = time.monotonic()
+    with pytest.raises(UserError, match=r"127\.0\.0\.1:1"):
+        next(ray.launch(grid(tmp_path), None, 1, Requests(), cluster=Cluster("127.0.0.1:1")))
+    with pytest.raises(UserError, match="host:port"):
+        next(ray.launch(grid(tmp_path), None, 1, Requests(), cluster=Cluster("somewhere")))
+    with pytest.raises(UserError, match=r"1000 cores and 0 GPUs .*--ray-cpus"):
+        next(ray.launch(grid(tmp_path), None, 1, Requests(), cluster=Cluster("local", cpus=1000)))
+    assert time.monotonic() - began < 60
+    assert not list(tmp_path.iterdir())

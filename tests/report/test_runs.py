@@ -1,0 +1,123 @@
+"""What may be averaged together, and what is refused by name."""
+
+import pytest
+
+from saclab.errors import UserError
+from saclab.report.runs import all_notices, notices, read_comparison, scale_notice, shown
+from saclab.training.run_folder import read_run
+
+from .synthetic import write_run
+
+SHORT = {"max_updates": 60_000}
+
+
+def test_groups_by_environment_variant_and_seed(tmp_path):
+    runs = [
+        write_run(tmp_path, variant, seed, environment)
+        for variant in ("averaged-auto", "sac") for seed in (2, 0) for environment in ("Humanoid-v4", "HalfCheetah-v4")
+    ]  # fmt: skip
+    comparison = read_comparison([*runs, runs[0]])
+    assert comparison.environments == ("HalfCheetah-v4", "Humanoid-v4")
+    assert [arm.name for arm in comparison.arms] == ["sac", "averaged-auto"]
+    assert [arm.title for arm in comparison.arms] == ["SAC", "Averaged-SAC, learned α"]
+    group = comparison.groups["Humanoid-v4", comparison.arms[0]]
+    assert [run.config.seed for run in group] == [0, 2]
+    assert comparison.mixed == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"overrides": {"max_updates": 5}}, "max_updates is 5 in .* and 1200000 in"),
+        ({"overrides": {"update_interval": 1}}, "update-to-data ratio is 1.0 in .* and 0.2 in"),
+        ({"overrides": {"polyak_rate": 0.01}}, "polyak_rate is 0.01 in .* and the variant's own 0.005 in"),
+        ({"overrides": {"snapshots": 3}}, "snapshots is 3"),
+        ({"versions": {"mujoco": "3.3.0"}}, "mujoco version is 3 in .* and 4 in"),
+        ({"versions": {"gymnasium": "2.0.1"}}, "gymnasium version is 2 in .* and 1 in"),
+        ({"rename": {"environment_arguments": {"a": 1}}}, "environment_arguments is {'a': 1}"),
+        ({"protocol": "standard"}, "protocol is standard in .* and paper in"),
+    ],
+)
+def test_refuses_what_differs_and_names_it(tmp_path, change, named):
+    runs = [write_run(tmp_path, "sac", seed) for seed in (0, 1)]
+    runs.append(write_run(tmp_path, "averaged", 0, name="other", **change))
+    with pytest.raises(UserError, match=f"^not comparable: {named}") as refused:
+        read_comparison(runs)
+    assert str(runs[-1]) in str(refused.value)
+
+
+def test_versions_that_do_not_change_the_task_are_no_reason(tmp_path):
+    runs = [write_run(tmp_path, "sac", 0), write_run(tmp_path, "sac", 1, versions={"mujoco": "4.9.9", "jax": "9"})]
+    assert len(read_comparison(runs).runs) == 2
+
+
+def test_two_versions_of_one_environment_are_refused(tmp_path):
+    runs = [write_run(tmp_path, environment=f"HalfCheetah-v{version}") for version in (4, 5)]
+    with pytest.raises(UserError, match="HalfCheetah-v4 and HalfCheetah-v5 are different tasks"):
+        read_comparison(runs)
+    assert len(read_comparison(runs, allow_mixed=True).environments) == 2
+
+
+def test_allowed_mixed_runs_stand_apart_and_are_labelled(tmp_path):
+    runs = [write_run(tmp_path, "averaged", seed) for seed in (0, 1)]
+    runs += [write_run(tmp_path, "averaged", seed, name="far", overrides={"snapshot_interval": 200}) for seed in (0, 1)]
+    comparison = read_comparison(runs, allow_mixed=True)
+    assert [arm.name for arm in comparison.arms] == ["averaged", "averaged (snapshot_interval 200)"]
+    assert [len(group) for group in comparison.groups.values()] == [2, 2]
+    assert len(comparison.mixed) == 1
+    assert "snapshot_interval is 200" in comparison.mixed[0]
+
+
+def test_same_seed_twice_names_both(tmp_path):
+    runs = [write_run(tmp_path / root, "sac", 7) for root in ("one", "two")]
+    for allow_mixed in (False, True):
+        with pytest.raises(UserError, match="same seed 7") as refused:
+            read_comparison(runs, allow_mixed)
+        assert all(str(run) in str(refused.value) for run in runs)
+
+
+def test_unknown_variant_is_grouped_by_its_settings(tmp_path):
+    runs = [write_run(tmp_path / str(seed), "sac", seed, rename={"variant": "mine"}) for seed in (0, 1)]
+    runs.append(write_run(tmp_path, "sac", 0))
+    assert [len(group) for group in read_comparison(runs).groups.values()] == [2, 1]
+    runs.append(write_run(tmp_path, "averaged", 2, rename={"variant": "mine"}))
+    with pytest.raises(UserError, match=r"snapshots is 10 in .* and 1 in"):
+        read_comparison(runs)
+
+
+def test_no_run_folder_and_no_run(tmp_path):
+    with pytest.raises(UserError, match="not a run folder"):
+        read_comparison([tmp_path])
+    with pytest.raises(UserError, match="no run"):
+        read_comparison([])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, None),
+        ({"overrides": SHORT}, "scaled down: 60,000 of 1,200,000 updates of the paper protocol"),
+        ({"overrides": {"max_steps": 60_000}}, "10,000 of 1,200,000 updates"),
+        ({"overrides": {"max_episodes": 500}}, "at most 500 episodes"),
+        ({"protocol": "quick"}, "quick protocol"),
+        ({"protocol": "standard", "overrides": {"max_steps": 20_000}}, "10,000 of 990,000 updates"),
+        ({"protocol": "standard"}, None),
+        ({"rename": {"protocol": "unheard-of"}}, None),
+    ],
+)
+def test_scaled_down_runs_are_noticed(tmp_path, options, said):
+    notice = scale_notice(read_run(write_run(tmp_path, **options)))
+    assert notice is None if said is None else said in notice
+
+
+def test_unfinished_and_untested_runs_are_noticed(tmp_path):
+    runs = [write_run(tmp_path, "sac", 0), write_run(tmp_path, "sac", 1, finished=False, evaluations=0)]
+    comparison = read_comparison(runs)
+    assert notices(comparison.runs) == ("1 of 2 runs unfinished", "1 of 2 runs without a test so far")
+    more = read_comparison([*runs, write_run(tmp_path, environment="Humanoid-v4", overrides=SHORT)])
+    assert "Humanoid-v4: Scaled down: 60,000 of 1,500,000 updates of the paper protocol" in all_notices(more)
+
+
+def test_shown_text_is_one_printable_line():
+    assert shown("a\nb\x00\u202e\ud800c") == "a b   c"
+    assert len(shown("x" * 500)) == 80

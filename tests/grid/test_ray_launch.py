@@ -14,6 +14,7 @@ import pytest
 
 from saclab import api
 from saclab.errors import SettingError, UserError
+from saclab.grid import ray as ray_launch
 from saclab.grid.plan import Cell, make_grid
 from saclab.grid.ray import LOSSES, Cluster, chosen_cluster, worker_variables
 from saclab.grid.tasks import RunStatus

@@ -77,9 +77,9 @@ def program_alone(batch: Batch, seconds: float) -> float:
         batch._advance(1, packed)
         made += runs
         if made % (20 * runs) == 0:  # no further ahead of the device than a training would be
-            batch.state.step.block_until_ready()
+            batch.state.key.block_until_ready()
 
-    value = rate(lambda: made, update, lambda: batch.state.step.block_until_ready(), seconds)
+    value = rate(lambda: made, update, lambda: batch.state.key.block_until_ready(), seconds)
     batch.undelivered, batch.undelivered_updates = [], 0
     return value
 
@@ -103,7 +103,7 @@ def whole_batch(batch: Batch, seconds: float) -> tuple[float, dict[str, float]]:
 
     batch._next_actions = next_actions  # type: ignore[method-assign]
     runs, began = len(batch.members), time.perf_counter()
-    value = rate(lambda: runs * batch.steps, batch.step, lambda: batch.state.step.block_until_ready(), seconds)
+    value = rate(lambda: runs * batch.steps, batch.step, lambda: batch.state.key.block_until_ready(), seconds)
     whole = time.perf_counter() - began
     shares = {name: round(part / whole, 3) for name, part in spent.items()}
     return value, {**shares, "waiting for actions": round((waited - spent["_launch"]) / whole, 3)}
@@ -142,7 +142,7 @@ def one_alone(environment: str, variant: str, seconds: float) -> float:
             run.step()
             run.window = []
 
-        return rate(lambda: run.counters.steps, step, lambda: run.learner_state.step.block_until_ready(), seconds)
+        return rate(lambda: run.counters.steps, step, lambda: run.learner_state.key.block_until_ready(), seconds)
 
 
 def main() -> None:

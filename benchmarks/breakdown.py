@@ -120,18 +120,18 @@ def update_breakdown(environment: str, variant: str, updates: int) -> dict[str, 
     operands = [[jnp.ones(shape) for shape in product.shapes] for product in products]
 
     def update() -> None:
-        run.learner_state, metrics = run.update(run.learner_state, rows)
+        run.learner_state, metrics = run.update(run.numbers, run.learner_state, rows, run.context)
         metrics.block_until_ready()
 
     @jax.jit
     def all_products(operands: list[list[jax.Array]]) -> list[jax.Array]:
         return [product.multiply(*pair) for product, pair in zip(products, operands, strict=True)]
 
-    nothing = jax.jit(lambda state, rows: (state, rows[0]))
+    nothing = jax.jit(lambda numbers, state, rows, context: (state, rows[0]))
     timed = {
         "whole": update,
         "matrix products": lambda: jax.block_until_ready(all_products(operands)),
-        "calling XLA": lambda: jax.block_until_ready(nothing(run.learner_state, rows)),
+        "calling XLA": lambda: jax.block_until_ready(nothing(run.numbers, run.learner_state, rows, run.context)),
     }
     milliseconds = alternating(timed, updates)
     run.close()

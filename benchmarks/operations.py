@@ -9,8 +9,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from saclab.algorithm.learner import make_learner
+from saclab.algorithm.scalars import scalars
+from saclab.algorithm.types import Context
 from saclab.config import AlgorithmSettings
 from saclab.replay import RowLayout
 
@@ -32,9 +35,11 @@ def update_operations(settings: AlgorithmSettings, layout: RowLayout) -> int:
 def matrix_products(settings: AlgorithmSettings, layout: RowLayout) -> list[MatrixProduct]:
     """The products of one update."""
     learner = make_learner(settings, layout.observation_size, layout.action_size)
-    state = learner.init(jax.random.PRNGKey(0))
+    numbers = scalars(settings, layout.action_size)
+    state = learner.init(numbers, jax.random.PRNGKey(0))
     batch = layout.unpack(jnp.zeros((settings.batch_size, layout.width)))
-    return list(products_of(jax.make_jaxpr(learner.update)(state, batch).jaxpr))
+    context = Context(np.int32(0), jnp.ones(layout.reward_terms), jnp.float32(1))
+    return list(products_of(jax.make_jaxpr(learner.update)(numbers, state, batch, context).jaxpr))
 
 
 def products_of(jaxpr: Any) -> Iterator[MatrixProduct]:

@@ -15,16 +15,16 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")  # tolerances are those of 32-bit 
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import pytest
 
 from saclab.algorithm.learner import Learner, make_learner
-from saclab.algorithm.networks import NETWORKS
-from saclab.algorithm.types import Batch, LearnerState
-from saclab.config import AlgorithmSettings
+from saclab.algorithm.scalars import Scalars, scalars
+from saclab.algorithm.types import Batch, Context, LearnerState
+from saclab.config import AlgorithmSettings, structure
 from saclab.variants import VARIANTS, variant_settings
 
 jax.config.update("jax_disable_most_optimizations", True)
@@ -48,7 +48,7 @@ def variant_case(variant: str, network: str) -> AlgorithmSettings:
     return dataclasses.replace(variant_settings(variant, "AnyEnvironment-v0"), network=network, **SMALL)
 
 
-VARIANT_CASES = {f"{variant}/{network}": variant_case(variant, network) for variant in VARIANTS for network in NETWORKS}
+VARIANT_CASES = {f"{variant}/mlp": variant_case(variant, "mlp") for variant in VARIANTS}
 MORE_CASES = {
     "three snapshots, three updates apart, mean for the actor": dataclasses.replace(
         VARIANT_CASES["averaged/mlp"], snapshots=3, snapshot_interval=3, actor_reduction="mean"
@@ -64,20 +64,62 @@ MORE_CASES = {
         log_std_minimum=-0.1,
         log_std_maximum=0.1,
     ),
+    "actor first and every third update, other betas, a schedule": dataclasses.replace(
+        VARIANT_CASES["sac-auto/mlp"],
+        update_order=("actor", "temperature", "critic", "targets"),
+        actor_interval=3,
+        adam_beta_1=0.5,
+        adam_beta_2=0.99,
+        learning_rate_schedule="linear",
+        final_learning_rate_share=0.25,
+    ),
+    "no target network, larger critics, cosine schedule": dataclasses.replace(
+        VARIANT_CASES["sac-auto/mlp"],
+        snapshots=0,
+        critic_hidden_layers=(9, 5),
+        learning_rate_schedule="cosine",
+        final_learning_rate_share=0.5,
+    ),
+    "one pass for both states": dataclasses.replace(VARIANT_CASES["averaged-auto/mlp"], joint_forward=True),
+    "a distribution over values, averaged": dataclasses.replace(
+        VARIANT_CASES["averaged-auto/mlp"], critic_head="categorical", critic_atoms=7, critic_bound=2.0
+    ),
+    "batch normalisation in one pass without a target network": dataclasses.replace(
+        VARIANT_CASES["sac-auto/mlp"], network="batch_norm_mlp", joint_forward=True, snapshots=0
+    ),
+    "batch normalisation of the critics, averaged distributions, unit columns": dataclasses.replace(
+        VARIANT_CASES["averaged-auto/mlp"],
+        critic_network="batch_norm_mlp",
+        joint_forward=True,
+        snapshots=3,
+        critic_head="categorical",
+        critic_atoms=5,
+        critic_bound=3.0,
+        weight_projection="unit_columns",
+    ),
 }
 
 
 class Case(NamedTuple):
-    """A learner whose update is compiled once for all tests."""
+    """A learner whose update is compiled once for all tests of its structure."""
 
     settings: AlgorithmSettings
     learner: Learner
-    update: Callable[[LearnerState, Batch], tuple]
+    numbers: Scalars
+    compiled: Callable[..., LearnerState]
     traces: list[None]
     """One entry for each time that JAX has traced the update."""
 
     def initial_state(self, seed: int = 0) -> LearnerState:
-        return self.learner.init(jax.random.PRNGKey(seed))
+        return self.learner.init(self.numbers, jax.random.PRNGKey(seed))
+
+    def update(self, state: LearnerState, batch: Batch, step: int) -> LearnerState:
+        """The update after `step` others."""
+        return self.compiled(self.numbers, state, batch, context(step))
+
+    def report(self, state: LearnerState) -> dict[str, float]:
+        """What the last update reported."""
+        return dict(zip(self.learner.metrics, np.asarray(state.report).tolist(), strict=True))
 
     def batch(self, generator: np.random.Generator) -> Batch:
         """Random transitions, a third of them terminal."""
@@ -85,33 +127,43 @@ class Case(NamedTuple):
         return Batch(
             observation=generator.standard_normal((size, OBSERVATION_SIZE)).astype(np.float32),
             action=generator.uniform(-1, 1, (size, ACTION_SIZE)).astype(np.float32),
-            reward=generator.standard_normal(size).astype(np.float32),
+            reward_terms=generator.standard_normal((size, 1)).astype(np.float32),
             next_observation=generator.standard_normal((size, OBSERVATION_SIZE)).astype(np.float32),
             terminated=(generator.uniform(size=size) < 1 / 3).astype(np.float32),
         )
 
 
+def context(step: int) -> Context:
+    """Rewards as they come."""
+    return Context(np.int32(step), np.ones(1, np.float32), np.float32(1))
+
+
 @lru_cache(maxsize=32)
-def make_case(settings: AlgorithmSettings) -> Case:
-    learner = make_learner(settings, OBSERVATION_SIZE, ACTION_SIZE)
+def compiled_learner(shape: AlgorithmSettings) -> tuple[Learner, Callable[..., LearnerState], list[None]]:
+    learner = make_learner(shape, OBSERVATION_SIZE, ACTION_SIZE)
     traces: list[None] = []
 
-    def update(state: LearnerState, batch: Batch) -> tuple:
+    def update(*arguments: Any) -> LearnerState:
         traces.append(None)
-        return learner.update(state, batch)
+        return learner.update(*arguments)
 
-    return Case(settings, learner, jax.jit(update), traces)
+    return learner, jax.jit(update), traces
+
+
+def make_case(settings: AlgorithmSettings) -> Case:
+    learner, compiled, traces = compiled_learner(structure(settings))
+    return Case(settings, learner, scalars(settings, ACTION_SIZE, planned_updates=10), compiled, traces)
 
 
 @pytest.fixture(params=VARIANT_CASES | MORE_CASES)
 def case(request: pytest.FixtureRequest) -> Case:
-    """Every variant on every network, and settings that no variant uses."""
+    """Every variant, and settings that no variant uses."""
     return make_case((VARIANT_CASES | MORE_CASES)[request.param])
 
 
 @pytest.fixture(params=VARIANT_CASES)
 def variant(request: pytest.FixtureRequest) -> Case:
-    """Every variant on every network."""
+    """Every variant."""
     return make_case(VARIANT_CASES[request.param])
 
 

@@ -19,7 +19,7 @@ def transitions(generator: np.random.Generator, count: int) -> Transitions:
     return Transitions(
         observation=generator.standard_normal((count, 3)).astype(np.float32),
         action=generator.uniform(-1, 1, (count, 2)).astype(np.float32),
-        reward=generator.standard_normal(count).astype(np.float32),
+        reward_terms=generator.standard_normal((count, 1)).astype(np.float32),
         next_observation=generator.standard_normal((count, 3)).astype(np.float32),
         terminated=generator.uniform(size=count) < 0.5,
     )
@@ -74,14 +74,14 @@ def numbered(capacity: int, added: int) -> ReplayBuffer:
     buffer = ReplayBuffer(capacity, layout)
     column = np.zeros((1, 1), np.float32)
     for number in range(added):
-        buffer.add(Transitions(column, column, np.array([number], np.float32), column, np.array([False])))
+        buffer.add(Transitions(column, column, np.array([[number]], np.float32), column, np.array([False])))
     return buffer
 
 
 @pytest.mark.parametrize(("added", "held"), [(12, range(12)), (20, range(20)), (33, range(13, 33))])
 def test_every_transition_held_is_drawn_equally_often_and_no_other(added, held):
     buffer = numbered(20, added)
-    drawn = buffer.layout.unpack(buffer.sample(np.random.default_rng(1), 40_000)).reward
+    drawn = buffer.layout.unpack(buffer.sample(np.random.default_rng(1), 40_000)).reward_terms[:, 0]
     numbers, counts = np.unique(drawn, return_counts=True)
     assert numbers.tolist() == list(held)
     assert chisquare(counts).pvalue > 0.01
@@ -90,7 +90,7 @@ def test_every_transition_held_is_drawn_equally_often_and_no_other(added, held):
 def test_the_rows_of_a_batch_are_drawn_independently_of_each_other():
     """As often all different as chance has it: 4! / 4⁴ of the batches of four out of four."""
     buffer, generator = numbered(4, 4), np.random.default_rng(2)
-    batches = [buffer.layout.unpack(buffer.sample(generator, 4)).reward for _ in range(2000)]
+    batches = [buffer.layout.unpack(buffer.sample(generator, 4)).reward_terms[:, 0] for _ in range(2000)]
     different = sum(len(np.unique(batch)) == 4 for batch in batches)
     assert chisquare([different, 2000 - different], [2000 * 24 / 256, 2000 * 232 / 256]).pvalue > 0.01
 

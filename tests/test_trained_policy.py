@@ -23,7 +23,7 @@ SPEC = EnvironmentSpec(3, 2, np.array([-2.0, 0.0], np.float32), np.array([2.0, 1
 def policy(tmp_path: Path) -> TrainedPolicy:
     """A random policy for SPEC that has been saved and loaded."""
     config = make_config("Some-v0", overrides=SIZES)
-    parameters = TrainedPolicy(config.algorithm, SPEC, np.zeros(0)).policy.network.parameters
+    parameters = TrainedPolicy(config.algorithm, SPEC, np.zeros(0)).policy.network.size
     actor = np.random.default_rng(0).normal(scale=0.3, size=parameters).astype(np.float32)
     save_policy(tmp_path / "best", config, SPEC, actor, {})
     return load_policy(tmp_path)

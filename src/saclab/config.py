@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from functools import lru_cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
 
 from saclab.errors import SettingError, unknown_name
 
@@ -23,84 +24,174 @@ def require(condition: bool, setting: str, value: object, way_out: str) -> None:
         raise SettingError(setting, value, way_out)
 
 
+PLAIN_NUMBER = "plain number"
+Real = Annotated[float, PLAIN_NUMBER]
+"""A setting that is an argument of the compiled update: another value needs no compilation, and runs that differ in
+such settings only can be trained as one group."""
+Whole = Annotated[int, PLAIN_NUMBER]
+
+Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
+NetworkName = Literal["mlp", "batch_norm_mlp"]
+Reduction = Literal["minimum", "mean"]
+UPDATES = ("critic", "actor", "temperature", "targets")
+
+
 @dataclass(frozen=True)
 class AlgorithmSettings:
     """One point in the space of SAC variants. Defaults: Table 1 of the paper, plain SAC."""
 
-    discount: float = 0.99
+    discount: Real = 0.99
     """γ: weight of the next state's value, in [0, 1)."""
     batch_size: int = 256
     """Transitions per update."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Real = 3e-4
     """Adam's learning rate for the Q-networks."""
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: Real = 3e-4
     """Adam's learning rate for the policy."""
+    adam_beta_1: Real = 0.9
+    """Decay of Adam's first moment, of all that is trained."""
+    adam_beta_2: Real = 0.999
+    """Decay of Adam's second moment, of all that is trained."""
+    learning_rate_schedule: Literal["constant", "linear", "cosine"] = "constant"
+    """How the three learning rates go from their values to `final_learning_rate_share` of them over the run's updates.
+    Each counts the steps of its own optimizer."""
+    final_learning_rate_share: Real = 1.0
+    """What is left of the learning rates at the end of the schedule, in [0, 1]."""
 
-    network: Literal["mlp"] = "mlp"
-    """Architecture of all networks."""
+    network: NetworkName = "mlp"
+    """Architecture of the policy, and of the Q-networks unless `critic_network` says another."""
+    critic_network: NetworkName | None = None
+    """Architecture of the Q-networks; None is `network`."""
     hidden_layers: tuple[int, ...] = (256, 256)
-    """Units of each hidden layer, of all networks."""
-    activation: Literal["relu", "tanh", "elu", "silu", "gelu"] = "relu"
+    """Units of each hidden layer of the policy, and of the Q-networks unless `critic_hidden_layers` says others."""
+    critic_hidden_layers: tuple[int, ...] | None = None
+    """Units of each hidden layer of the Q-networks; None is `hidden_layers`."""
+    activation: Activation = "relu"
     """Non-linearity after each hidden layer."""
+    weight_projection: Literal["none", "unit_columns"] = "none"
+    """What is done to the weight matrices after each step: nothing, or the weights into each unit are scaled to
+    length 1."""
     critics: int = 2
     """Q-networks that are trained side by side."""
+    critic_head: Literal["scalar", "categorical"] = "scalar"
+    """What a Q-network predicts: a number, or a distribution over `critic_atoms` values."""
+    critic_atoms: int = 101
+    """Values of the categorical head, evenly spaced from −`critic_bound` to `critic_bound`."""
+    critic_bound: float = 5.0
+    """The largest value that the categorical head can represent."""
+    joint_forward: bool = False
+    """Whether the critics see (s, a) and (s′, a′) in one pass, so that batch statistics are those of both."""
 
-    polyak_rate: float = 0.005
+    polyak_rate: Real = 0.005
     """τ: share of the critic that enters its target at each update (Eq. 2)."""
     snapshots: int = 1
-    """K: target snapshots over which the next state's value is averaged (Eq. 9). 1 is plain SAC."""
-    snapshot_interval: int = 1
+    """K: target snapshots over which the next state's value is averaged (Eq. 9). 1 is plain SAC, 0 has no target
+    network: the critics themselves value the next state."""
+    snapshot_interval: Whole = 1
     """Updates between two target snapshots. 1 is the literal Eq. 9."""
     entropy_window: int = 1
     """Minibatches over which α·log π of the target is averaged row by row, from zeros: what the paper's authors
     ran as "Averaged-SAC". The rows are unrelated to each other; this is not Eq. 9. 1 is plain SAC."""
-    target_reduction: Literal["minimum", "mean"] = "minimum"
+    target_reduction: Reduction = "minimum"
     """How the critics are reduced to one Q in the target (Eq. 4)."""
-    actor_reduction: Literal["minimum", "mean"] = "minimum"
+    actor_reduction: Reduction = "minimum"
     """How the critics are reduced to one Q in the policy loss (Eq. 5)."""
+
+    update_order: tuple[str, ...] = UPDATES
+    """Order of the parts of an update; each sees what those before it have changed."""
+    actor_interval: int = 1
+    """Updates between two updates of the policy and the temperature."""
 
     temperature: Literal["fixed", "learned"] = "fixed"
     """Whether α is fixed or learned by dual descent (Eq. 8)."""
-    initial_temperature: float = 0.2
+    initial_temperature: Real = 0.2
     """α, or its first value if it is learned."""
-    temperature_learning_rate: float = 3e-4
+    temperature_learning_rate: Real = 3e-4
     """Adam's learning rate for log α, if it is learned."""
     temperature_gradient: Literal["log_alpha", "alpha"] = "log_alpha"
     """The factor before (−log π − target entropy) in the temperature loss: log α (the paper's authors,
     Stable-Baselines3) or α itself (Eq. 8 to the letter, CleanRL). Adam moves log α in both cases."""
-    target_entropy: float | None = None
+    target_entropy: Annotated[float | None, PLAIN_NUMBER] = None
     """Entropy that the learned temperature holds the policy to, in nats; None is −dim(A)."""
     log_std_minimum: float = -20.0
     """Lower clip of the policy's log standard deviation."""
     log_std_maximum: float = 2.0
     """Upper clip of the policy's log standard deviation."""
 
+    longest_noise: int = 1
+    """Most steps for which one draw of the exploration noise is held; how many, n, is drawn with a probability
+    proportional to n⁻². 1 is a draw for each step."""
+    reward_scaling: Literal["none", "deviation", "deviation_or_bound"] = "none"
+    """What rewards are divided by when a batch is drawn: nothing, the running standard deviation of the discounted
+    return, or the larger of it and the largest discounted return so far divided by `critic_bound`."""
+
     def __post_init__(self) -> None:
-        require(0 <= self.discount < 1, "discount", self.discount, "use a value in [0, 1), such as 0.99")
-        require(0 < self.polyak_rate <= 1, "polyak_rate", self.polyak_rate, "use a value in (0, 1], such as 0.005")
-        for name in ("batch_size", "critics", "snapshots", "snapshot_interval", "entropy_window"):
-            require(getattr(self, name) >= 1, name, getattr(self, name), "use a whole number of at least 1")
-        for name in ("critic_learning_rate", "actor_learning_rate", "temperature_learning_rate"):
-            require(0 <= getattr(self, name) < 1, name, getattr(self, name), "use a value in [0, 1), such as 3e-4")
-        require(
-            len(self.hidden_layers) > 0 and min(self.hidden_layers) >= 1,
-            "hidden_layers", self.hidden_layers, "use one or more positive widths, such as 256 256",
-        )  # fmt: skip
-        lowest_allowed = "above 0" if self.temperature == "learned" else "of at least 0"
-        require(
-            self.initial_temperature > 0 or (self.temperature == "fixed" and self.initial_temperature == 0),
-            "initial_temperature", self.initial_temperature, f"use a value {lowest_allowed}, such as 0.2",
-        )  # fmt: skip
-        require(
-            self.log_std_minimum < self.log_std_maximum,
-            "log_std_minimum", self.log_std_minimum, f"use a value below log_std_maximum {self.log_std_maximum}",
-        )  # fmt: skip
-        require(
-            self.snapshots == 1 or self.entropy_window == 1,
-            "entropy_window", self.entropy_window,
-            f"use 1 together with snapshots {self.snapshots}: averaging values (Eq. 9) and averaging the entropy "
-            "term are two different algorithms",
-        )  # fmt: skip
+        require_ranges(self)
+        require_possible(self)
+
+    @property
+    def layers_of_critic(self) -> tuple[int, ...]:
+        return self.hidden_layers if self.critic_hidden_layers is None else self.critic_hidden_layers
+
+    @property
+    def network_of_critic(self) -> NetworkName:
+        return self.network if self.critic_network is None else self.critic_network
+
+
+def require_ranges(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for a value that cannot work whatever the others are."""
+
+    def check(name: str, condition: Callable[[Any], bool], way_out: str) -> None:
+        require(condition(getattr(settings, name)), name, getattr(settings, name), way_out)
+
+    check("discount", lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.99")
+    check("polyak_rate", lambda value: 0 < value <= 1, "use a value in (0, 1], such as 0.005")
+    check("snapshots", lambda value: value >= 0, "use a whole number, of 0 for no target network")
+    check("critic_atoms", lambda value: value >= 2, "use a whole number of at least 2, such as 101")
+    check("critic_bound", lambda value: value > 0, "use a value above 0, such as 5")
+    check("final_learning_rate_share", lambda value: 0 <= value <= 1, "use a value in [0, 1], such as 0.5")
+    for name in ("batch_size", "critics", "snapshot_interval", "entropy_window", "actor_interval", "longest_noise"):
+        check(name, lambda value: value >= 1, "use a whole number of at least 1")
+    for name in ("critic_learning_rate", "actor_learning_rate", "temperature_learning_rate"):
+        check(name, lambda value: 0 <= value < 1, "use a value in [0, 1), such as 3e-4")
+    for name in ("adam_beta_1", "adam_beta_2"):
+        check(name, lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.9")
+    for name in ("hidden_layers", "critic_hidden_layers"):
+        check(
+            name,
+            lambda layers: layers is None or (len(layers) > 0 and min(layers) >= 1),
+            "use one or more positive widths, such as 256 256",
+        )
+
+
+def require_possible(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for values that cannot work together."""
+    lowest_allowed = "above 0" if settings.temperature == "learned" else "of at least 0"
+    require(
+        settings.initial_temperature > 0 or (settings.temperature == "fixed" and settings.initial_temperature == 0),
+        "initial_temperature", settings.initial_temperature, f"use a value {lowest_allowed}, such as 0.2",
+    )  # fmt: skip
+    require(
+        settings.log_std_minimum < settings.log_std_maximum,
+        "log_std_minimum", settings.log_std_minimum, f"use a value below log_std_maximum {settings.log_std_maximum}",
+    )  # fmt: skip
+    require(
+        settings.snapshots <= 1 or settings.entropy_window == 1,
+        "entropy_window", settings.entropy_window,
+        f"use 1 together with snapshots {settings.snapshots}: averaging values (Eq. 9) and averaging the entropy "
+        "term are two different algorithms",
+    )  # fmt: skip
+    require(
+        settings.critic_head != "categorical" or settings.entropy_window == 1,
+        "entropy_window", settings.entropy_window,
+        "use 1 together with critic_head categorical: it averages numbers, not distributions",
+    )  # fmt: skip
+    order = settings.update_order
+    require(
+        sorted(order) == sorted(UPDATES) and order.index("actor") < order.index("temperature"),
+        "update_order", " ".join(order),
+        f"name each of {', '.join(UPDATES)} once, and actor before temperature, which is judged by its entropy",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -205,6 +296,11 @@ class Config:
             batch <= training.replay_capacity,
             "batch_size", batch, f"use at most replay_capacity {training.replay_capacity}",
         )  # fmt: skip
+        require(
+            self.algorithm.learning_rate_schedule == "constant" or self.planned_updates is not None,
+            "learning_rate_schedule", self.algorithm.learning_rate_schedule,
+            "give max_updates or max_steps too: it must know how many updates there will be",
+        )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able dictionary; `from_dict` is its inverse."""
@@ -214,13 +310,19 @@ class Config:
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
         """Rebuild a Config from `to_dict`; raises SettingError for a setting this version does not know."""
-        algorithm = dict(values["algorithm"])
-        algorithm["hidden_layers"] = tuple(algorithm["hidden_layers"])
         return Config(
             **{key: value for key, value in values.items() if key not in ("algorithm", "training")},
-            algorithm=replace_settings(AlgorithmSettings(), algorithm),
+            algorithm=algorithm_from_json(values["algorithm"]),
             training=replace_settings(TrainingSettings(max_steps=1, evaluation_interval_steps=1), values["training"]),
         )
+
+    @property
+    def planned_updates(self) -> int | None:
+        """Updates of a run that goes to its limit of updates or steps; None if it has neither."""
+        training = self.training
+        if training.max_steps is None:
+            return training.max_updates
+        return training.updates_due(training.max_steps)
 
     def differences(self, other: Config) -> dict[str, tuple[Any, Any]]:
         """Settings whose values differ: name -> (value here, value there)."""
@@ -253,3 +355,27 @@ def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settin
         if name not in known:
             raise unknown_name("setting", name, known)
     return dataclasses.replace(settings, **overrides)
+
+
+def algorithm_from_json(values: Mapping[str, Any]) -> AlgorithmSettings:
+    """The settings in a JSON object, where tuples are lists; raises SettingError for one that does not exist."""
+    return replace_settings(
+        AlgorithmSettings(),
+        {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()},
+    )
+
+
+@lru_cache(maxsize=1)
+def plain_numbers() -> tuple[str, ...]:
+    """Names of the settings that are arguments of the compiled update."""
+    hints = get_type_hints(AlgorithmSettings, include_extras=True)
+    return tuple(name for name, hint in hints.items() if PLAIN_NUMBER in getattr(hint, "__metadata__", ()))
+
+
+def structure(settings: AlgorithmSettings) -> AlgorithmSettings:
+    """`settings` with all plain numbers at their defaults: what a compiled program depends on.
+
+    Whether α is learned is a plain number too: the learning rate of a fixed one is 0.
+    """
+    defaults = {name: getattr(AlgorithmSettings, name) for name in plain_numbers()}
+    return dataclasses.replace(settings, temperature="learned", **defaults)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
 
-from saclab.algorithm.networks import Array
+from saclab.algorithm.networks.network import Array
 from saclab.algorithm.types import Batch
 from saclab.environments.vector import Transitions
 from saclab.errors import SettingError
@@ -14,34 +15,42 @@ from saclab.machine import available_memory
 
 
 class RowLayout(NamedTuple):
-    """How a transition lies in a row: observation, action, reward, next observation, terminated."""
+    """The named columns of a row, in which a transition lies as 32-bit numbers."""
 
     observation_size: int
     action_size: int
+    reward_terms: int = 1
+    """What the reward is the weighted sum of; 1 is the reward itself."""
+
+    @property
+    def columns(self) -> dict[str, int]:
+        """Name -> width, in their order: the fields of Transitions and Batch."""
+        return {
+            "observation": self.observation_size,
+            "action": self.action_size,
+            "reward_terms": self.reward_terms,
+            "next_observation": self.observation_size,
+            "terminated": 1,
+        }
 
     @property
     def width(self) -> int:
         """Numbers in a row."""
-        return 2 * self.observation_size + self.action_size + 2
+        return sum(self.columns.values())
 
     def pack(self, transitions: Transitions) -> np.ndarray:
         """f32[N, width]."""
-        columns = (transitions.reward[:, None], transitions.next_observation, transitions.terminated[:, None])
-        rows: np.ndarray = np.concatenate([transitions.observation, transitions.action, *columns], axis=1)
+        columns = [getattr(transitions, name).reshape(-1, width) for name, width in self.columns.items()]
+        rows: np.ndarray = np.concatenate(columns, axis=1)
         return rows.astype(np.float32, copy=False)
 
     def unpack(self, rows: Array) -> Batch:
         """A batch from f32[B, width], NumPy or JAX."""
-        action = self.observation_size
-        reward = action + self.action_size
-        terminated = self.width - 1
-        return Batch(
-            observation=rows[:, :action],
-            action=rows[:, action:reward],
-            reward=rows[:, reward],
-            next_observation=rows[:, reward + 1 : terminated],
-            terminated=rows[:, terminated],
-        )
+        ends = accumulate(self.columns.values())
+        parts = {
+            name: rows[:, end - width : end] for (name, width), end in zip(self.columns.items(), ends, strict=True)
+        }
+        return Batch(**parts | {"terminated": parts["terminated"][:, 0]})
 
 
 class ReplayBuffer:

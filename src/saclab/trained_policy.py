@@ -11,7 +11,7 @@ import numpy as np
 import safetensors.numpy
 
 from saclab.algorithm.policy import make_policy
-from saclab.config import AlgorithmSettings, Config
+from saclab.config import AlgorithmSettings, Config, algorithm_from_json
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.files import replace_file, write_json
@@ -110,8 +110,7 @@ def load_policy(run: Path | str) -> TrainedPolicy:
     description = read_description(folder)
     try:
         arrays = safetensors.numpy.load((folder / ARRAYS).read_bytes())
-        algorithm = description["algorithm"]
-        settings = AlgorithmSettings(**{**algorithm, "hidden_layers": tuple(algorithm["hidden_layers"])})
+        settings = algorithm_from_json(description["algorithm"])
         sizes = int(description["observation_size"]), int(description["action_size"])
         policy = TrainedPolicy(
             settings, EnvironmentSpec(*sizes, arrays["action_low"], arrays["action_high"]), arrays["actor"]
@@ -128,7 +127,7 @@ def require_arrays(policy: TrainedPolicy) -> None:
     """Raise ValueError unless the arrays are those of the policy's sizes."""
     spec = policy.spec
     expected = {
-        "actor": (policy.parameters, (policy.policy.network.parameters,)),
+        "actor": (policy.parameters, (policy.policy.network.size,)),
         "action_low": (spec.action_low, (spec.action_size,)),
         "action_high": (spec.action_high, (spec.action_size,)),
     }

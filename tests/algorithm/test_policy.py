@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from saclab.algorithm.networks import ACTIVATIONS, NETWORKS
+from saclab.algorithm.networks.network import ACTIVATIONS
 from saclab.algorithm.policy import make_policy, squash
 from saclab.config import AlgorithmSettings
 
@@ -79,16 +79,11 @@ def small_policy(**changes):
 
 def test_the_log_std_is_clipped_and_the_mean_is_not():
     policy = small_policy(log_std_minimum=-3.0, log_std_maximum=1.0)
-    parameters = np.zeros(policy.network.parameters, np.float32)
+    parameters = np.zeros(policy.network.size, np.float32)
     parameters[-4:] = [7.0, -7.0, 5.0, -5.0]  # the biases of the last layer: two means, two log-stds
     mean, log_std = policy.distribution(parameters, np.zeros((1, 3), np.float32))
     assert mean.tolist() == [[7.0, -7.0]]
     assert log_std.tolist() == [[1.0, -3.0]]
-
-
-def test_the_default_clip_is_that_of_the_sac_papers():
-    policy = small_policy()
-    assert (policy.log_std_minimum, policy.log_std_maximum) == (-20, 2)
 
 
 def test_the_mode_is_tanh_of_the_mean_and_the_action_without_noise():
@@ -105,7 +100,7 @@ def test_the_mode_is_tanh_of_the_mean_and_the_action_without_noise():
 def test_a_policy_does_the_same_in_numpy_and_in_jax(activation):
     policy = small_policy(activation=activation)
     generator = np.random.default_rng(1)
-    parameters = generator.standard_normal(policy.network.parameters).astype(np.float32)
+    parameters = generator.standard_normal(policy.network.size).astype(np.float32)
     observation, noise = (generator.standard_normal((7, n)).astype(np.float32) for n in (3, 2))
     in_numpy = (policy.mode(parameters, observation), policy.act(parameters, observation, noise),
                 *policy.sample(parameters, observation, noise))  # fmt: skip
@@ -119,43 +114,6 @@ def test_a_policy_does_the_same_in_numpy_and_in_jax(activation):
     np.testing.assert_array_equal(in_numpy[1], in_numpy[2])  # `act` is `sample` without its log-density
 
 
-@pytest.mark.parametrize("name", ACTIVATIONS)
-def test_an_activation_is_the_one_of_its_name(name):
-    x = np.linspace(-5, 5, 101, dtype=np.float32)
-    known = {"relu": jax.nn.relu, "tanh": jnp.tanh, "elu": jax.nn.elu, "silu": jax.nn.silu, "gelu": jax.nn.gelu}
-    np.testing.assert_allclose(ACTIVATIONS[name](x), known[name](x), rtol=1e-5, atol=1e-6)
-
-
-def test_an_mlp_by_hand():
-    network = NETWORKS["mlp"](2, (2,), 1, "relu")
-    #              [[1, -1], [2, 0]]      [0, 3]     [[1], [-2]]  [0.5]
-    parameters = np.array([1.0, -1.0, 2.0, 0.0, 0.0, 3.0, 1.0, -2.0, 0.5])
-    assert network.parameters == len(parameters)
-    # (1, 1): hidden 3, 2 -> 3 - 4 + 0.5;   (-1, 0): hidden -1 -> 0, 4 -> -8 + 0.5
-    assert network.apply(parameters, np.array([[1.0, 1.0], [-1.0, 0.0]])).tolist() == [[-0.5], [-7.5]]
-
-
-def test_inputs_that_belong_side_by_side_may_come_apart():
-    network = NETWORKS["mlp"](3, (5,), 2, "tanh")
-    parameters = np.asarray(network.init(jax.random.PRNGKey(0)))
-    x = np.random.default_rng(0).standard_normal((4, 3)).astype(np.float32)
-    whole = network.apply(parameters, x)
-    np.testing.assert_allclose(network.apply(parameters, x[:, :2], x[:, 2:]), whole, rtol=1e-5)
-
-    def total(*inputs):
-        return jnp.sum(network.apply(jnp.asarray(parameters), *inputs))
-
-    np.testing.assert_allclose(jax.grad(total, 1)(x[:, :2], x[:, 2:]), jax.grad(total)(x)[:, 2:], rtol=1e-5)
-
-
-def test_weights_and_biases_start_uniform_within_one_over_the_root_of_the_inputs():
-    network = NETWORKS["mlp"](100, (400,), 1, "relu")
-    first = np.asarray(network.init(jax.random.PRNGKey(0)))[: 101 * 400]
-    assert np.abs(first).max() == pytest.approx(0.1, rel=1e-3)
-    assert first.std() == pytest.approx(0.1 / math.sqrt(3), rel=0.02)
-    assert abs(first.mean()) < 0.001
-
-
 def test_different_seeds_give_different_networks():
     first, second = (small_policy().network.init(jax.random.PRNGKey(seed)) for seed in (0, 1))
     assert not np.array_equal(first, second)
@@ -166,5 +124,5 @@ def test_different_seeds_give_different_networks():
 )
 def test_a_policy_has_two_outputs_for_each_action(settings):
     policy = make_policy(settings, 5, 3)
-    mean, log_std = policy.distribution(np.zeros(policy.network.parameters, np.float32), np.zeros((4, 5), np.float32))
+    mean, log_std = policy.distribution(np.zeros(policy.network.size, np.float32), np.zeros((4, 5), np.float32))
     assert mean.shape == log_std.shape == (4, 3)

@@ -10,12 +10,13 @@ import math
 from functools import lru_cache
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from saclab.algorithm.learner import make_learner
-from saclab.algorithm.networks import NETWORKS
-from saclab.algorithm.types import Batch
+from saclab.algorithm.scalars import scalars
+from saclab.algorithm.types import Batch, Context
 from saclab.config import AlgorithmSettings
 
 DISCOUNT, ALPHA, UPDATES, BATCH = 0.6, 0.5, 1000, 32
@@ -34,15 +35,21 @@ SETTINGS = {
 
 @lru_cache(maxsize=8)
 def trainer(settings: AlgorithmSettings):
-    learner = make_learner(settings, 1, 1)
-    return learner, jax.jit(lambda state, batches: jax.lax.scan(learner.update, state, batches))
+    learner, numbers = make_learner(settings, 1, 1), scalars(settings, 1)
+
+    def update(state, batch_and_step):
+        batch, step = batch_and_step
+        state = learner.update(numbers, state, batch, Context(step, jnp.ones(1), jnp.float32(1)))
+        return state, state.report
+
+    return learner, numbers, jax.jit(lambda state, batches: jax.lax.scan(update, state, (batches, jnp.arange(UPDATES))))
 
 
 def stream(reward, state, next_state, terminated, action) -> Batch:
     """All updates' batches, from arrays or numbers that fit [UPDATES, BATCH]."""
     columns = (np.broadcast_to(x, (UPDATES, BATCH)).astype(np.float32) for x in (reward, state, next_state, terminated))
     reward, state, next_state, terminated = columns
-    return Batch(state[..., None], action[..., None], reward, next_state[..., None], terminated)
+    return Batch(state[..., None], action[..., None], reward[..., None], next_state[..., None], terminated)
 
 
 def uniform_actions() -> np.ndarray:
@@ -54,20 +61,19 @@ class Trained:
 
     def __init__(self, batches: Batch, **changes) -> None:
         settings = AlgorithmSettings(**{**SETTINGS, **changes})
-        self.learner, train = trainer(settings)
-        self.state, metrics = train(self.learner.init(jax.random.PRNGKey(0)), batches)
-        self.metrics = jax.tree.map(lambda values: float(np.mean(values[-100:])), metrics)
-        self.network = NETWORKS["mlp"](2, settings.hidden_layers, 1, settings.activation)
+        self.learner, numbers, train = trainer(settings)
+        self.state, reports = train(self.learner.init(numbers, jax.random.PRNGKey(0)), batches)
+        self.metrics = dict(zip(self.learner.metrics, np.mean(reports[-100:], axis=0).tolist(), strict=True))
 
     def q(self, state: float, action: float = 0.3) -> list[float]:
         """Each critic's value."""
         inputs = np.array([state, action], np.float32)
-        return [float(self.network.apply(critic, inputs)[0]) for critic in np.asarray(self.state.critic)]
+        return [float(self.learner.q_values(critic, inputs)) for critic in np.asarray(self.state.critic.weights)]
 
     def actions(self, state: float, count: int = 20_000) -> np.ndarray:
         noise = np.random.default_rng(0).standard_normal((count, 1)).astype(np.float32)
         observation = np.full((count, 1), state, np.float32)
-        return self.learner.policy.act(np.asarray(self.state.actor), observation, noise)[:, 0]
+        return self.learner.policy.act(np.asarray(self.state.actor.weights), observation, noise)[:, 0]
 
 
 def test_a_one_step_episode_is_worth_its_reward_without_any_entropy():
@@ -75,11 +81,20 @@ def test_a_one_step_episode_is_worth_its_reward_without_any_entropy():
     assert trained.q(1.0) == pytest.approx([2.0, 2.0], abs=0.05)
 
 
-@pytest.mark.parametrize("changes", [{}, {"snapshots": 3, "snapshot_interval": 5}], ids=["sac", "averaged"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"snapshots": 3, "snapshot_interval": 5},
+        {"critic_head": "categorical", "critic_bound": 8.0, "critic_atoms": 33},
+        {"network": "batch_norm_mlp", "snapshots": 0, "joint_forward": True},
+    ],
+    ids=["sac", "averaged", "categorical", "batch norm without target"],
+)
 def test_an_episode_that_only_time_ends_is_worth_all_its_future_rewards_and_entropies(changes):
     batches = stream(reward=2.0, state=1.0, next_state=1.0, terminated=0, action=uniform_actions())
     trained = Trained(batches, **changes)
-    assert trained.metrics.entropy == pytest.approx(UNIFORM_ENTROPY, abs=0.02)
+    assert trained.metrics["entropy"] == pytest.approx(UNIFORM_ENTROPY, abs=0.02)
     worth = 2.0 / (1 - DISCOUNT) + DISCOUNT / (1 - DISCOUNT) * ALPHA * UNIFORM_ENTROPY  # 5 + 0.52
     assert trained.q(1.0) == pytest.approx([worth, worth], abs=0.08)
 
@@ -112,5 +127,5 @@ def test_the_learned_temperature_settles_where_the_policy_has_the_target_entropy
     batches = stream(reward=-3 * actions**2, state=1.0, next_state=1.0, terminated=1, action=actions)
     trained = Trained(batches, temperature="learned", target_entropy=0.0)
     # exp(-3a²/α) is close to a Gaussian of variance α/6, whose entropy ½ log(2πe α/6) is 0 at α = 6/(2πe)
-    assert trained.metrics.entropy == pytest.approx(0.0, abs=0.05)
-    assert trained.metrics.temperature == pytest.approx(6 / (2 * math.pi * math.e), rel=0.15)
+    assert trained.metrics["entropy"] == pytest.approx(0.0, abs=0.05)
+    assert trained.metrics["temperature"] == pytest.approx(6 / (2 * math.pi * math.e), rel=0.15)

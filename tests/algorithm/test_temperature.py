@@ -8,67 +8,54 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import make_case
 
-from saclab.algorithm.numbers import numbers_of
-from saclab.algorithm.temperature import TEMPERATURES
+from saclab.algorithm.losses import temperature_loss
 from saclab.config import AlgorithmSettings
 
-RATE = 0.01
 
-
-def learned(gradient: str = "log_alpha", target_entropy: float | None = None, actions: int = 2):
-    settings = AlgorithmSettings(
-        temperature="learned",
-        temperature_gradient=gradient,
-        temperature_learning_rate=RATE,
-        target_entropy=target_entropy,
-    )
-    return TEMPERATURES["learned"](settings, numbers_of(settings, actions))
-
-
-def step(temperature, log_alpha: float, log_prob):
-    value = jnp.asarray(log_alpha, jnp.float32)
-    return temperature.update(value, temperature.init(value), jnp.asarray(log_prob, jnp.float32))
+def loss_and_slope(log_alpha: float, entropy: float, target: float, factor: str) -> tuple[float, float]:
+    numbers = (jnp.float32(value) for value in (log_alpha, entropy, target))
+    loss, slope = jax.value_and_grad(temperature_loss)(*numbers, factor)
+    return float(loss), float(slope)
 
 
 def test_on_log_alpha_the_loss_is_log_alpha_times_the_entropy_above_the_target():
-    # mean(-log π) = 2, the target is -2: log ½ · 4
-    _, state, loss = step(learned("log_alpha"), math.log(0.5), [-1.0, -3.0])
-    assert loss == pytest.approx(math.log(0.5) * 4, rel=1e-6)
-    assert state[0].mu / 0.1 == pytest.approx(4, rel=1e-5)  # the gradient, as Adam's first moment has it
+    assert loss_and_slope(math.log(0.5), 2.0, -2.0, "log_alpha") == pytest.approx((math.log(0.5) * 4, 4), rel=1e-6)
 
 
 def test_on_alpha_the_loss_is_alpha_times_the_entropy_above_the_target():
-    _, state, loss = step(learned("alpha"), math.log(0.5), [-1.0, -3.0])
-    assert loss == pytest.approx(0.5 * 4, rel=1e-6)
-    assert state[0].mu / 0.1 == pytest.approx(0.5 * 4, rel=1e-5)  # with respect to log α
+    assert loss_and_slope(math.log(0.5), 2.0, -2.0, "alpha") == pytest.approx((0.5 * 4, 0.5 * 4), rel=1e-6)
 
 
 @pytest.mark.parametrize("gradient", ["log_alpha", "alpha"])
-@pytest.mark.parametrize(("entropy", "direction"), [(-1.0, -1), (-3.0, 1)])
-def test_alpha_falls_above_the_target_entropy_and_rises_below_it(gradient, entropy, direction):
-    log_alpha, _, _ = step(learned(gradient), 0.0, [-entropy])  # the target is -2
-    assert log_alpha == pytest.approx(direction * RATE, rel=1e-4)  # Adam's first step is the learning rate
+@pytest.mark.parametrize(("above", "direction"), [(1.0, -1), (-1.0, 1)])
+def test_alpha_falls_above_the_target_entropy_and_rises_below_it(gradient, above, direction):
+    entropy = first_entropy()
+    moved = log_alpha_after_one_update(temperature_gradient=gradient, target_entropy=entropy - above)
+    assert moved == pytest.approx(direction * 0.01, rel=1e-3)  # Adam's first step is the learning rate
 
 
-def test_alpha_stays_where_the_entropy_is_the_given_target():
-    log_alpha, _, loss = step(learned(target_entropy=0.5), 0.3, [-0.25, -0.75])
-    assert (float(log_alpha), float(loss)) == (np.float32(0.3), 0.0)
-
-
-@pytest.mark.parametrize("actions", [1, 6, 17])
-def test_the_target_entropy_is_minus_the_number_of_actions_unless_it_is_given(actions):
-    _, _, loss = step(learned(actions=actions), 1.0, [0.0])
-    assert loss == actions
-
-
-def test_no_gradient_flows_from_the_temperature_loss_into_the_policy():
-    temperature = learned()
-    slope = jax.grad(lambda log_prob: step(temperature, 1.0, log_prob)[2])(jnp.array([1.0, 2.0]))
-    assert slope.tolist() == [0.0, 0.0]
+def test_the_target_entropy_is_minus_the_number_of_actions_unless_it_is_given():
+    state, report = after_one_update()  # α = 1: log α = 0, and so is the loss
+    assert report["temperature_loss"] == 0
+    assert state.temperature.moments.mu / 0.1 == pytest.approx(report["entropy"] + 2, rel=1e-5)  # two actions
 
 
 def test_a_fixed_temperature_stays_for_any_entropy():
-    fixed = TEMPERATURES["fixed"](AlgorithmSettings(), numbers_of(AlgorithmSettings(), 2))
-    log_alpha, _, loss = step(fixed, -1.5, [100.0])
-    assert (float(log_alpha), float(loss)) == (-1.5, 0.0)
+    assert log_alpha_after_one_update(temperature="fixed", initial_temperature=0.25) == np.log(np.float32(0.25))
+
+
+def after_one_update(**changes):
+    settings = {"temperature": "learned", "initial_temperature": 1.0, "temperature_learning_rate": 0.01}
+    case = make_case(AlgorithmSettings(hidden_layers=(8,), batch_size=6, **settings | changes))
+    state = case.update(case.initial_state(), case.batch(np.random.default_rng(0)), 0)
+    return state, case.report(state)
+
+
+def first_entropy() -> float:
+    return after_one_update()[1]["entropy"]
+
+
+def log_alpha_after_one_update(**changes) -> float:
+    return float(after_one_update(**changes)[0].temperature.weights)

@@ -151,7 +151,7 @@ def test_a_run_that_breaks_leaves_the_others_untouched(tmp_path, monkeypatch, ho
         story = json.loads((folder / "failure/failure.json").read_text())
         arrays = safetensors.numpy.load((folder / "failure/state.safetensors").read_bytes())
         assert (story["counters"]["steps"], story["counters"]["updates"]) == (99, 19), "as before the step that broke"
-        assert (int(arrays[".step"]), len(arrays["recent_transitions"])) == (19, 99)
+        assert (int(arrays[".actor.moments.count"]), len(arrays["recent_transitions"])) == (19, 99)
         assert ("in step" in story["traceback"]) == (how == "raise")
 
 
@@ -166,17 +166,22 @@ def test_an_environment_that_breaks_in_a_test_ends_its_own_run(tmp_path, monkeyp
     assert all("wheels came off" in message for message in failures(told).values())
 
 
+def spoil_critic(batch, slot):
+    critic = batch.state.critic
+    batch.state = batch.state._replace(critic=critic._replace(weights=critic.weights.at[slot].set(np.nan)))
+
+
 def test_a_learner_that_is_not_finite_at_the_last_save_ends_its_own_run(tmp_path):
     configs = mixed()
 
     def spoil(batch):
         batch.flush()
-        batch.state = batch.state._replace(critic=batch.state.critic.at[1].set(np.nan))
+        spoil_critic(batch, 1)
 
     with at_step(240, spoil):
         told = train(tmp_path, configs)
     assert failures(told).keys() == {1}
-    assert "critic is not finite" in failures(told)[1]
+    assert "critic.weights is not finite" in failures(told)[1]
     assert [is_finished(folder) for folder in folders(tmp_path, configs)] == [True, False, True]
 
 
@@ -186,7 +191,7 @@ def test_a_run_whose_update_breaks_is_told_of_the_update(tmp_path):
     def breaking(batch, updates, packed):
         real(batch, updates, packed)
         if batch.steps == 102:
-            batch.state = batch.state._replace(critic=batch.state.critic.at[2].set(np.nan))
+            spoil_critic(batch, 2)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Batch, "_advance", breaking)

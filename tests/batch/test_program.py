@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from saclab.algorithm.numbers import numbers_of
-from saclab.batch.batch import number_arrays
-from saclab.batch.member import alone, init_settings, of_batch
+from saclab.algorithm.scalars import scalars
+from saclab.algorithm.types import Context
 from saclab.batch.program import Arrival, Program
+from saclab.config import structure
 from saclab.replay import RowLayout
 from saclab.training import seeds
 from saclab.training.course import named_leaves
@@ -32,29 +32,32 @@ def test_each_slot_is_updated_by_its_own_numbers(snapshots):
     settings = [each.algorithm for each in mixed(snapshots=snapshots, batch_size=16)]
     settings.append(config(snapshots=snapshots, batch_size=16, snapshot_interval=4, temperature="fixed",
                            initial_temperature=0.0).algorithm)  # fmt: skip
-    states = [compiled_init(each, LAYOUT)(seeds.learner_key(run)) for run, each in enumerate(settings)]
+    numbers = [scalars(each, 2) for each in settings]
+    shape = structure(settings[0])
+    init, update = compiled_init(shape, LAYOUT), compiled_update(shape, LAYOUT)
+    states = [init(own, seeds.learner_key(run)) for run, own in enumerate(numbers)]
     random = np.random.default_rng(0)
     rows = random.standard_normal((len(settings), CAPACITY, LAYOUT.width)).astype(np.float32)
     drawn = random.integers(0, CAPACITY, (len(settings), 5, 16), np.int32)
 
-    program = Program(settings[0], LAYOUT, environments=2, slots=len(settings))
-    numbers = stacked([number_arrays(numbers_of(each, 2)) for each in settings])
+    program = Program(shape, LAYOUT, environments=2, slots=len(settings))
     newest = rows[:, [CAPACITY - 1, 0]]  # two environments: the second row wraps around
     before = rows.copy()
     before[:, [CAPACITY - 1, 0]] = 0
     position = np.full(len(settings), CAPACITY - 1, np.int32)
     packed = program.arrival(5).pack(len(settings), rows=newest, position=position, drawn=drawn)
     state, replay, metrics = program.advance(
-        5, numbers, program.put(stacked([of_batch(each) for each in states])), program.put(before), program.put(packed)
-    )
+        5, stacked(numbers), program.put(stacked(states)), program.put(before), program.put(packed),
+        Context(np.int32(0), np.ones((len(settings), 1), np.float32), np.ones(len(settings), np.float32)),
+    )  # fmt: skip
     np.testing.assert_array_equal(replay, rows)
-    for run, own in enumerate(settings):
+    for run, own in enumerate(numbers):
         expected = states[run]
-        update = compiled_update(own, LAYOUT)
         for turn in range(5):
-            expected, values = update(expected, rows[run][drawn[run, turn]])
+            now = Context(np.int32(turn), np.ones(1, np.float32), np.float32(1))
+            expected, values = update(own, expected, rows[run][drawn[run, turn]], now)
             np.testing.assert_allclose(metrics[run, turn], values, rtol=2e-4, atol=2e-5)
-        found = named_leaves(alone(jax.tree.map(lambda leaf, run=run: leaf[run], state), own))
+        found = named_leaves(jax.tree.map(lambda leaf, run=run: leaf[run], state))
         assert found.keys() == named_leaves(expected).keys()
         for name, value in named_leaves(expected).items():
             np.testing.assert_allclose(found[name], value, rtol=1e-3, atol=2e-5, err_msg=f"{run}{name}")
@@ -62,17 +65,17 @@ def test_each_slot_is_updated_by_its_own_numbers(snapshots):
 
 def test_actions_are_those_of_each_runs_policy():
     configs = mixed()
-    states = [compiled_init(each.algorithm, LAYOUT)(seeds.learner_key(each.seed)) for each in configs]
-    program = Program(configs[0].algorithm, LAYOUT, environments=4, slots=3)
-    numbers = stacked([number_arrays(numbers_of(each.algorithm, 2)) for each in configs])
+    shape = structure(configs[0].algorithm)
+    init = compiled_init(shape, LAYOUT)
+    actors = [init(scalars(each.algorithm, 2), seeds.learner_key(each.seed)).actor.weights for each in configs]
+    program = Program(shape, LAYOUT, environments=4, slots=3)
     random = np.random.default_rng(1)
     observation = random.standard_normal((3, 4, 3)).astype(np.float32)
     noise = random.standard_normal((3, 4, 2)).astype(np.float32)
     packed = program.arrival(1).pack(3, observation=observation, noise=noise)
-    action = program.act(numbers, stacked([each.actor for each in states]), packed)
-    policy = program._learner(numbers_of(configs[0].algorithm, 2)).policy
-    for run, state in enumerate(states):
-        expected = policy.act(np.asarray(state.actor), observation[run], noise[run])
+    action = program.act(stacked(actors), packed)
+    for run, actor in enumerate(actors):
+        expected = program.learner.policy.act(np.asarray(actor), observation[run], noise[run])
         np.testing.assert_allclose(action[run], expected, rtol=1e-5, atol=1e-6)
 
 
@@ -98,4 +101,4 @@ def test_what_arrives_is_taken_apart_bit_for_bit():
 def test_runs_that_differ_in_plain_numbers_start_from_one_compiled_function():
     first, second = (each.algorithm for each in mixed()[1:])
     assert first != second
-    assert init_settings(first) == init_settings(second)
+    assert structure(first) == structure(second)

@@ -1,16 +1,20 @@
 """Soft Actor-Critic written straight from the paper's equations in 64-bit NumPy: every gradient by hand.
 
-It shares no code with saclab and is laid out otherwise where it can be: parameters are lists of (weights, bias), the
-targets of the past are a list that only grows, and noise is handed in. It is slow and plain on purpose.
+It shares no code with saclab but the names of the settings, and is laid out otherwise where it can be: parameters are
+lists of (weights, bias), the targets of the past are a list that only grows, and noise is handed in. It is slow and
+plain on purpose.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from saclab.config import AlgorithmSettings
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 """Weights [inputs, outputs] and bias [outputs] of each layer."""
@@ -41,9 +45,12 @@ def backward(layers: Layers, inputs: list[np.ndarray], d_output: np.ndarray) -> 
 
 @dataclass
 class Adam:
-    """Kingma and Ba, Algorithm 1."""
+    """Kingma and Ba, Algorithm 1, with a schedule of the learning rate by its own steps."""
 
     learning_rate: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    share: Callable[[int], float] = lambda step: 1.0
+    """Of the learning rate, after so many steps."""
     first: list[np.ndarray] = field(default_factory=list)
     second: list[np.ndarray] = field(default_factory=list)
     count: int = 0
@@ -52,14 +59,15 @@ class Adam:
         if not self.first:
             self.first = [np.zeros_like(p) for p in parameters]
             self.second = [np.zeros_like(p) for p in parameters]
+        rate = self.learning_rate * self.share(self.count)
         self.count += 1
-        changed = []
+        changed, (a, b) = [], self.betas
         for i, (parameter, gradient) in enumerate(zip(parameters, gradients, strict=True)):
-            self.first[i] = 0.9 * self.first[i] + 0.1 * gradient
-            self.second[i] = 0.999 * self.second[i] + 0.001 * gradient**2
-            mean = self.first[i] / (1 - 0.9**self.count)
-            variance = self.second[i] / (1 - 0.999**self.count)
-            changed.append(parameter - self.learning_rate * mean / (np.sqrt(variance) + 1e-8))
+            self.first[i] = a * self.first[i] + (1 - a) * gradient
+            self.second[i] = b * self.second[i] + (1 - b) * gradient**2
+            mean = self.first[i] / (1 - a**self.count)
+            variance = self.second[i] / (1 - b**self.count)
+            changed.append(parameter - rate * mean / (np.sqrt(variance) + 1e-8))
         return changed
 
     def step_layers(self, layers: Layers, gradients: Layers) -> Layers:
@@ -70,46 +78,108 @@ def paired(flat: list[np.ndarray]) -> Layers:
     return list(zip(flat[::2], flat[1::2], strict=True))
 
 
+def schedule(kind: str, last: float, steps: int) -> Callable[[int], float]:
+    """The share of a learning rate that is left after a number of steps."""
+
+    def share(step: int) -> float:
+        done = min(step / steps, 1)
+        if kind == "linear":
+            return 1 + done * (last - 1)
+        if kind == "cosine":
+            return last + (1 - last) * (1 + math.cos(math.pi * done)) / 2
+        return 1.0
+
+    return share
+
+
+class ScalarHead:
+    """Q is the one output."""
+
+    def q(self, outputs: np.ndarray) -> np.ndarray:
+        return outputs[:, 0]
+
+    def predict(self, outputs: np.ndarray) -> np.ndarray:
+        return outputs
+
+    q_of_prediction = q
+
+    def target(self, prediction: np.ndarray, reward, discount, entropy_term) -> np.ndarray:
+        return (reward + discount * (prediction[:, 0] - entropy_term))[:, None]
+
+    def loss(self, outputs: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray]:
+        """Eq. 3 of one critic, and its gradient with respect to the outputs."""
+        error = outputs - target
+        return float(np.mean(error**2) / 2), error / len(error)
+
+    def d_q(self, outputs: np.ndarray) -> np.ndarray:
+        """The gradient of each row's Q with respect to its outputs."""
+        return np.ones_like(outputs)
+
+
+class CategoricalHead:
+    """The outputs are logits of evenly spaced values."""
+
+    def __init__(self, atoms: int, bound: float) -> None:
+        self.values = np.array([-bound + 2 * bound * i / (atoms - 1) for i in range(atoms)])
+
+    def predict(self, outputs: np.ndarray) -> np.ndarray:
+        e = np.exp(outputs)
+        return e / e.sum(axis=1, keepdims=True)
+
+    def q_of_prediction(self, probability: np.ndarray) -> np.ndarray:
+        return probability @ self.values
+
+    def q(self, outputs: np.ndarray) -> np.ndarray:
+        return self.predict(outputs) @ self.values
+
+    def target(self, prediction: np.ndarray, reward, discount, entropy_term) -> np.ndarray:
+        """C51's projection, row by row and value by value."""
+        target, step = np.zeros_like(prediction), self.values[1] - self.values[0]
+        for row in range(len(prediction)):
+            for i, probability in enumerate(prediction[row]):
+                moved = reward[row] + discount[row] * (self.values[i] - entropy_term[row])
+                place = (min(max(moved, self.values[0]), self.values[-1]) - self.values[0]) / step
+                below = min(math.floor(place), len(self.values) - 2)
+                target[row, below] += probability * (below + 1 - place)
+                target[row, below + 1] += probability * (place - below)
+        return target
+
+    def loss(self, outputs: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray]:
+        probability = self.predict(outputs)
+        return float(-(target * np.log(probability)).sum(axis=1).mean()), (probability - target) / len(outputs)
+
+    def d_q(self, outputs: np.ndarray) -> np.ndarray:
+        probability = self.predict(outputs)
+        return probability * (self.values - (probability @ self.values)[:, None])
+
+
 class NumpySac:
     """The state of a learner and its update."""
 
     def __init__(
-        self,
-        actor: Layers,
-        critics: list[Layers],
-        *,
-        discount: float,
-        polyak_rate: float,
-        critic_learning_rate: float,
-        actor_learning_rate: float,
-        temperature_learning_rate: float,
-        initial_temperature: float,
-        temperature: str,
-        temperature_gradient: str,
-        target_entropy: float,
-        snapshots: int,
-        snapshot_interval: int,
-        entropy_window: int,
-        target_reduction: str,
-        actor_reduction: str,
-        log_std_minimum: float,
-        log_std_maximum: float,
-        batch_size: int,
+        self, actor: Layers, critics: list[Layers], settings: AlgorithmSettings, target_entropy: float, updates: int
     ) -> None:
-        self.actor, self.critics = actor, critics
-        self.discount, self.polyak_rate = discount, polyak_rate
-        self.log_alpha = math.log(initial_temperature)
-        self.learned, self.temperature_gradient = temperature == "learned", temperature_gradient
+        """`updates` is the length of the learning rates' schedule."""
+        self.actor, self.critics, self.settings = actor, critics, settings
+        self.log_alpha = math.log(settings.initial_temperature)
         self.target_entropy = target_entropy
-        self.snapshots, self.snapshot_interval = snapshots, snapshot_interval
-        self.target_reduction, self.actor_reduction = target_reduction, actor_reduction
-        self.log_std_range = log_std_minimum, log_std_maximum
+        self.log_std_range = settings.log_std_minimum, settings.log_std_maximum
+        self.head = (
+            ScalarHead()
+            if settings.critic_head == "scalar"
+            else CategoricalHead(settings.critic_atoms, settings.critic_bound)
+        )
         self.targets: list[list[Layers]] = [critics]
         """The target critics after 0, 1, 2, … updates."""
-        self.entropy_terms = deque([np.zeros(batch_size)] * entropy_window, maxlen=entropy_window)
-        self.actor_adam = Adam(actor_learning_rate)
-        self.critic_adams = [Adam(critic_learning_rate) for _ in critics]
-        self.temperature_adam = Adam(temperature_learning_rate)
+        window = settings.entropy_window
+        self.entropy_terms = deque([np.zeros(settings.batch_size)] * window, maxlen=window)
+        betas = settings.adam_beta_1, settings.adam_beta_2
+        share = schedule(settings.learning_rate_schedule, settings.final_learning_rate_share, updates)
+        self.actor_adam = Adam(settings.actor_learning_rate, betas, share)
+        self.critic_adams = [Adam(settings.critic_learning_rate, betas, share) for _ in critics]
+        self.temperature_adam = Adam(settings.temperature_learning_rate, betas, share)
+        self.report: dict[str, float] = {}
+        self.updates = 0
 
     def averaged_targets(self) -> list[list[Layers]]:
         """The K target critics of Eq. 9: the present one, then those left behind, newest first.
@@ -117,9 +187,11 @@ class NumpySac:
         One is left behind at every `snapshot_interval`-th update, as it was before that update; before there are
         enough of them, the first target stands for the missing ones.
         """
-        updates = len(self.targets) - 1
-        marks = updates // self.snapshot_interval
-        left_behind = [(marks - back) * self.snapshot_interval - 1 for back in range(self.snapshots - 1)]
+        count, interval = self.settings.snapshots, self.settings.snapshot_interval
+        if count == 0:
+            return [self.critics]
+        marks = (len(self.targets) - 1) // interval
+        left_behind = [(marks - back) * interval - 1 for back in range(count - 1)]
         return [self.targets[-1]] + [self.targets[max(0, when)] for when in left_behind]
 
     def sample(self, observation: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple]:
@@ -144,76 +216,95 @@ class NumpySac:
         next_noise: np.ndarray,
         actor_noise: np.ndarray,
     ) -> dict[str, float]:
-        """One update of critics, actor, temperature, target; what `Metrics` reports."""
-        batch = len(reward)
-        alpha = math.exp(self.log_alpha)
+        """One update of everything; what it reports."""
+        self.report["temperature"] = math.exp(self.log_alpha)
+        acts = self.updates % self.settings.actor_interval == 0
+        for part in self.settings.update_order:
+            if part == "critic":
+                self.update_critic(observation, action, reward, next_observation, terminated, next_noise)
+            if part == "actor" and acts:
+                self.update_actor(observation, actor_noise)
+            if part == "temperature" and acts:
+                self.update_temperature()
+            if part == "targets":
+                self.update_targets()
+        self.updates += 1
+        return self.report
 
+    def update_critic(self, observation, action, reward, next_observation, terminated, noise) -> None:
         # Eq. 4 and 9: the value of the next state.
-        next_action, next_log_prob, _ = self.sample(next_observation, next_noise)
-        values = []
+        next_action, next_log_prob, _ = self.sample(next_observation, noise)
+        reduced, rows = [], np.arange(len(reward))
         for target in self.averaged_targets():
-            q = [forward(layers, np.hstack([next_observation, next_action]))[0][:, 0] for layers in target]
-            values.append(np.min(q, axis=0) if self.target_reduction == "minimum" else np.mean(q, axis=0))
-        self.entropy_terms.append(alpha * next_log_prob)
-        value = sum(values) / len(values) - sum(self.entropy_terms) / len(self.entropy_terms)
-        y = reward + self.discount * (1 - terminated) * value
+            outputs = [forward(layers, np.hstack([next_observation, next_action]))[0] for layers in target]
+            predictions = np.array([self.head.predict(output) for output in outputs])
+            q = np.array([self.head.q(output) for output in outputs])
+            smallest = self.settings.target_reduction == "minimum"
+            reduced.append(predictions[q.argmin(axis=0), rows] if smallest else predictions.mean(axis=0))
+        prediction = sum(reduced) / len(reduced)
+        self.entropy_terms.append(math.exp(self.log_alpha) * next_log_prob)
+        entropy_term = sum(self.entropy_terms) / len(self.entropy_terms)
+        y = self.head.target(prediction, reward, self.settings.discount * (1 - terminated), entropy_term)
 
         # Eq. 3: each critic towards y.
-        critic_loss, predictions, changed = 0.0, [], []
+        critic_loss, predicted, changed = 0.0, [], []
         for layers, adam in zip(self.critics, self.critic_adams, strict=True):
-            q, inputs = forward(layers, np.hstack([observation, action]))
-            error = q[:, 0] - y
-            critic_loss += np.mean(error**2) / 2
-            gradients, _ = backward(layers, inputs, error[:, None] / batch)
+            outputs, inputs = forward(layers, np.hstack([observation, action]))
+            loss, d_outputs = self.head.loss(outputs, y)
+            gradients, _ = backward(layers, inputs, d_outputs)
             changed.append(adam.step_layers(layers, gradients))
-            predictions.append(q[:, 0])
+            predicted.append(self.head.q(outputs))
+            critic_loss += loss
         self.critics = changed
+        self.report |= {
+            "critic_loss": critic_loss,
+            "q_mean": np.mean(predicted),
+            "q_spread": np.mean(np.std(predicted, axis=0)),
+            "target_mean": np.mean(self.head.q_of_prediction(y)),
+            "snapshot_spread": np.mean(np.std([self.head.q_of_prediction(one) for one in reduced], axis=0)),
+        }
 
-        # Eq. 5 on the changed critics: the actor, through the reparametrised action.
-        sampled, log_prob, (inputs, log_std, inside) = self.sample(observation, actor_noise)
+    def update_actor(self, observation, noise) -> None:
+        # Eq. 5 on the critics as they are now: the actor, through the reparametrised action.
+        batch, alpha = len(observation), math.exp(self.log_alpha)
+        sampled, log_prob, (inputs, log_std, inside) = self.sample(observation, noise)
         passes = [forward(layers, np.hstack([observation, sampled])) for layers in self.critics]
-        q = np.array([output[:, 0] for output, _ in passes])
-        if self.actor_reduction == "minimum":
+        q = np.array([self.head.q(output) for output, _ in passes])
+        if self.settings.actor_reduction == "minimum":
             share = (np.arange(len(q))[:, None] == q.argmin(axis=0)).astype(float)
         else:
             share = np.full_like(q, 1 / len(q))
-        actor_loss = np.mean(alpha * log_prob - (share * q).sum(axis=0))
         d_action = np.zeros_like(sampled)
-        for layers, (_, critic_inputs), weight in zip(self.critics, passes, share, strict=True):
-            _, d_input = backward(layers, critic_inputs, -weight[:, None] / batch)
+        for layers, (outputs, critic_inputs), weight in zip(self.critics, passes, share, strict=True):
+            d_outputs = -weight[:, None] / batch * self.head.d_q(outputs)
+            _, d_input = backward(layers, critic_inputs, d_outputs)
             d_action += d_input[:, observation.shape[1] :]
         d_u = d_action * (1 - sampled**2) + alpha / batch * 2 * sampled  # d log π / du = 2 tanh u
-        d_log_std = (d_u * np.exp(log_std) * actor_noise - alpha / batch) * inside
+        d_log_std = (d_u * np.exp(log_std) * noise - alpha / batch) * inside
         gradients, _ = backward(self.actor, inputs, np.hstack([d_u, d_log_std]))
         self.actor = self.actor_adam.step_layers(self.actor, gradients)
+        self.report["actor_loss"] = np.mean(alpha * log_prob - (share * q).sum(axis=0))
+        self.report["entropy"] = -np.mean(log_prob)
 
+    def update_temperature(self) -> None:
         # Eq. 8: the temperature, from the log-densities of the actor before its change.
-        temperature_loss = 0.0
-        if self.learned:
-            excess = np.mean(-log_prob - self.target_entropy)
-            on_alpha = self.temperature_gradient == "alpha"
-            temperature_loss = (alpha if on_alpha else self.log_alpha) * excess
-            gradient = alpha * excess if on_alpha else excess  # both with respect to log α
-            (self.log_alpha,) = self.temperature_adam.step([np.array(self.log_alpha)], [np.array(gradient)])
+        if self.settings.temperature == "fixed":
+            self.report["temperature_loss"] = 0.0
+            return
+        alpha, excess = math.exp(self.log_alpha), self.report["entropy"] - self.target_entropy
+        on_alpha = self.settings.temperature_gradient == "alpha"
+        self.report["temperature_loss"] = (alpha if on_alpha else self.log_alpha) * excess
+        gradient = alpha * excess if on_alpha else excess  # both with respect to log α
+        (self.log_alpha,) = self.temperature_adam.step([np.array(self.log_alpha)], [np.array(gradient)])
 
+    def update_targets(self) -> None:
         # Eq. 2: the target moves towards the changed critics.
-        self.targets.append(
-            [
-                [
-                    tuple((1 - self.polyak_rate) * old + self.polyak_rate * new for old, new in zip(before, now))
-                    for before, now in zip(target, critic)
-                ]
-                for target, critic in zip(self.targets[-1], self.critics)
+        rate = self.settings.polyak_rate
+        moved = []
+        for target, critic in zip(self.targets[-1], self.critics):
+            layers = [
+                tuple((1 - rate) * old + rate * new for old, new in zip(before, now))
+                for before, now in zip(target, critic)
             ]
-        )
-        return {
-            "critic_loss": critic_loss,
-            "actor_loss": actor_loss,
-            "temperature_loss": temperature_loss,
-            "temperature": alpha,
-            "entropy": -np.mean(log_prob),
-            "q_mean": np.mean(predictions),
-            "q_spread": np.mean(np.std(predictions, axis=0)),
-            "target_mean": np.mean(y),
-            "snapshot_spread": np.mean(np.std(values, axis=0)),
-        }
+            moved.append(layers)
+        self.targets.append(moved)

@@ -7,15 +7,18 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from conftest import ACTION_SIZE, MORE_CASES, OBSERVATION_SIZE, VARIANT_CASES, make_case
 
 from .numpy_sac import Layers, NumpySac, backward, forward
 
+ALL_CASES = VARIANT_CASES | MORE_CASES
+
 UPDATES = 13  # beyond K = 10 and beyond three snapshots three updates apart
-SHARED = (
-    "discount", "polyak_rate", "critic_learning_rate", "actor_learning_rate", "temperature_learning_rate",
-    "initial_temperature", "temperature", "temperature_gradient", "snapshots", "snapshot_interval", "entropy_window",
-    "target_reduction", "actor_reduction", "log_std_minimum", "log_std_maximum", "batch_size",
-)  # fmt: skip
+
+
+def batch_normalised(settings) -> bool:
+    """The reference knows perceptrons only; `test_networks.py` looks after the others."""
+    return "batch_norm_mlp" in (settings.network, settings.network_of_critic)
 
 
 def unpack(parameters, sizes) -> Layers:
@@ -36,27 +39,31 @@ def pack_layers(layers: Layers) -> np.ndarray:
     return pack([array for layer in layers for array in layer])
 
 
-def reference_of(settings, state, observation_size, action_size) -> NumpySac:
-    actor_sizes = (observation_size, *settings.hidden_layers, 2 * action_size)
-    critic_sizes = (observation_size + action_size, *settings.hidden_layers, 1)
+def reference_of(case, state) -> NumpySac:
+    settings = case.settings
+    outputs = 1 if settings.critic_head == "scalar" else settings.critic_atoms
+    actor_sizes = (OBSERVATION_SIZE, *settings.hidden_layers, 2 * ACTION_SIZE)
+    critic_sizes = (OBSERVATION_SIZE + ACTION_SIZE, *settings.layers_of_critic, outputs)
     return NumpySac(
-        unpack(state.actor, actor_sizes),
-        [unpack(critic, critic_sizes) for critic in state.critic],
-        target_entropy=-action_size if settings.target_entropy is None else settings.target_entropy,
-        **{name: getattr(settings, name) for name in SHARED},
+        unpack(state.actor.weights, actor_sizes),
+        [unpack(critic, critic_sizes) for critic in state.critic.weights],
+        settings,
+        target_entropy=-ACTION_SIZE if settings.target_entropy is None else settings.target_entropy,
+        updates=int(case.numbers["planned_updates"]),
     )
 
 
-def noises(state, batch_size: int, action_size: int) -> tuple[np.ndarray, np.ndarray]:
+def noises(state, step: int, batch_size: int) -> tuple[np.ndarray, np.ndarray]:
     """Update t draws from `fold_in(key, t)`: first for the next actions, then for the actor."""
-    keys = jax.random.split(jax.random.fold_in(state.key, state.step))
-    next_noise, actor_noise = (np.asarray(jax.random.normal(key, (batch_size, action_size))) for key in keys)
+    keys = jax.random.split(jax.random.fold_in(state.key, step))
+    next_noise, actor_noise = (np.asarray(jax.random.normal(key, (batch_size, ACTION_SIZE))) for key in keys)
     return next_noise.astype(np.float64), actor_noise.astype(np.float64)
 
 
 def expected_ring(reference: NumpySac) -> np.ndarray:
     """f64[K, C, P]: where the ring keeps each of the averaged targets."""
-    size, marks = reference.snapshots, (len(reference.targets) - 1) // reference.snapshot_interval
+    size = reference.settings.snapshots
+    marks = (len(reference.targets) - 1) // reference.settings.snapshot_interval
     ring = [None] * size
     for back, target in enumerate(reference.averaged_targets()):
         ring[(marks - back) % size] = np.stack([pack_layers(layers) for layers in target])
@@ -70,37 +77,38 @@ def assert_close(actual, expected, what: str) -> None:
 
 def assert_same_update(case) -> None:
     state, generator = case.initial_state(seed=3), np.random.default_rng(5)
-    first = case.batch(generator)
-    observation_size, action_size = first.observation.shape[1], first.action.shape[1]
-    reference = reference_of(case.settings, state, observation_size, action_size)
-    for number in range(UPDATES):
+    reference = reference_of(case, state)
+    for step in range(UPDATES):
         batch = case.batch(generator)
-        noise = noises(state, case.settings.batch_size, action_size)
-        state, metrics = case.update(state, batch)
-        expected = reference.update(*(np.asarray(column, np.float64) for column in batch), *noise)
+        columns = [np.asarray(column, np.float64) for column in batch]
+        columns[2] = columns[2][:, 0]  # one term: the reward
+        noise = noises(state, step, case.settings.batch_size)
+        state = case.update(state, batch, step)
+        expected = reference.update(*columns, *noise)
 
-        where = f"after update {number + 1}"
-        assert_close(state.actor, pack_layers(reference.actor), f"actor {where}")
-        assert_close(state.log_alpha, reference.log_alpha, f"log α {where}")
-        assert_close(state.target.snapshots, expected_ring(reference), f"ring {where}")
-        table = np.roll(reference.entropy_terms, number + 1, axis=0)
-        assert_close(state.target.entropy_terms, table, f"entropy terms {where}")
-        adam = state.optimizers.actor[0]
+        where = f"after update {step + 1}"
+        assert_close(state.actor.weights, pack_layers(reference.actor), f"actor {where}")
+        assert_close(state.temperature.weights, reference.log_alpha, f"log α {where}")
+        if case.settings.snapshots:
+            assert_close(state.targets, expected_ring(reference), f"ring {where}")
+        table = np.roll(reference.entropy_terms, step + 1, axis=0)
+        assert_close(state.entropy_terms, table, f"entropy terms {where}")
+        adam = state.actor.moments
         assert_close(adam.mu, pack(reference.actor_adam.first), f"actor's first moment {where}")
         assert_close(adam.nu, pack(reference.actor_adam.second), f"actor's second moment {where}")
-        adam = state.optimizers.critic[0]
+        adam = state.critic.moments
         for index, layers in enumerate(reference.critics):
             moments = reference.critic_adams[index]
-            assert_close(state.critic[index], pack_layers(layers), f"critic {index} {where}")
+            assert_close(state.critic.weights[index], pack_layers(layers), f"critic {index} {where}")
             assert_close(adam.mu[index], pack(moments.first), f"critic {index}'s first moment {where}")
             assert_close(adam.nu[index], pack(moments.second), f"critic {index}'s second moment {where}")
-        for name, value in metrics._asdict().items():
+        for name, value in case.report(state).items():
             assert_close(value, expected[name], f"{name} {where}")
-        assert state.step == number + 1
 
 
-def test_the_composed_update_equals_the_reference(case):
-    assert_same_update(case)
+@pytest.mark.parametrize("name", [name for name, settings in ALL_CASES.items() if not batch_normalised(settings)])
+def test_the_composed_update_equals_the_reference(name):
+    assert_same_update(make_case(ALL_CASES[name]))
 
 
 def test_it_also_does_with_all_of_xlas_optimisations(case_of):

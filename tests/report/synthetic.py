@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from saclab.algorithm.types import Metrics
+from saclab.algorithm.learner import metric_names
+from saclab.config import AlgorithmSettings
 from saclab.protocols import make_config
 from saclab.training.run_folder import EPISODE_COLUMNS, FORMAT, Q_BIAS_COLUMNS, evaluation_columns, run_path
 
 VERSIONS = {"saclab": "0.1.0", "jax": "0.10.2", "gymnasium": "1.4.0", "mujoco": "4.0.0", "python": "3.11.9"}
 TEST_EPISODES = 20
-METRICS = Metrics._fields
+METRICS = metric_names(AlgorithmSettings())
 
 
 def write_run(

@@ -30,7 +30,7 @@ def buffer_at(step: int) -> ReplayBuffer:
     replay = ReplayBuffer(CAPACITY, LAYOUT)
     for number in range(step):
         column = np.full((1, 1), number, np.float32)
-        replay.add(Transitions(column.repeat(2, 1), column, column[:, 0], column.repeat(2, 1), np.array([False])))
+        replay.add(Transitions(column.repeat(2, 1), column, column, column.repeat(2, 1), np.array([False])))
     return replay
 
 

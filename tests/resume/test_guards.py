@@ -15,7 +15,6 @@ import safetensors.numpy
 from environments import tiny  # noqa: F401 - registers them
 
 from saclab import replay
-from saclab.algorithm.types import Metrics
 from saclab.errors import NonFiniteError, SettingError, TrainingFailed
 from saclab.protocols import make_config
 from saclab.training import checkpoint, journal, loop
@@ -55,7 +54,7 @@ def test_an_environment_that_breaks_stops_the_run_with_its_step(tmp_path, what):
     assert np.isnan(arrays["next_observation"]).any() == (what == "observation")
     assert np.isnan(arrays["reward"]) == (what == "reward")
     assert arrays["recent_transitions"].shape == (2, 3 + 1 + 1 + 3 + 1)
-    assert ".actor" in arrays
+    assert ".actor.weights" in arrays
 
 
 @pytest.mark.parametrize("field", ["critic_loss", "temperature"])
@@ -67,11 +66,11 @@ def test_an_update_that_breaks_is_named_and_the_environment_is_not_blamed(tmp_pa
         real(run, config)
         update = run.update
 
-        def breaking(state, rows):
-            state, metrics = update(state, rows)
+        def breaking(numbers, state, rows, context):
+            state, metrics = update(numbers, state, rows, context)
             if run.counters.updates == 9:
-                metrics = metrics.at[Metrics._fields.index(field)].set(jnp.nan)
-                state = state._replace(actor=state.actor * jnp.nan)
+                metrics = metrics.at[run.metrics.index(field)].set(jnp.nan)
+                state = state._replace(actor=state.actor._replace(weights=state.actor.weights * jnp.nan))
             return state, metrics
 
         run.update = breaking
@@ -88,15 +87,17 @@ def test_an_update_that_breaks_is_named_and_the_environment_is_not_blamed(tmp_pa
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_learner_that_is_not_finite_is_not_saved(tmp_path, value):
     run = Run(small_config("Pendulum-v1"))
-    run.learner_state = run.learner_state._replace(critic=run.learner_state.critic.at[0, 0].set(value))
-    with pytest.raises(NonFiniteError, match=r"\.critic is not finite"):
+    critic = run.learner_state.critic
+    broken_critic = critic._replace(weights=critic.weights.at[0, 0].set(value))
+    run.learner_state = run.learner_state._replace(critic=broken_critic)
+    with pytest.raises(NonFiniteError, match=r"\.critic\.weights is not finite"):
         run.capture()
     run.close()
 
 
 def test_a_fixed_temperature_of_zero_has_a_logarithm_that_is_saved():
     run = Run(small_config("Pendulum-v1", "sac", initial_temperature=0.0))
-    assert np.isneginf(run.capture().groups["learner"][".log_alpha"])
+    assert np.isneginf(run.capture().groups["learner"][".temperature.weights"])
     run.close()
 
 
@@ -142,7 +143,7 @@ def resident():
     return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) * 1024
 
 layout, capacity, some = RowLayout(376, 17), 40_000, 400
-rows = Transitions(np.ones((some, 376), np.float32), np.ones((some, 17), np.float32), np.ones(some, np.float32),
+rows = Transitions(np.ones((some, 376), np.float32), np.ones((some, 17), np.float32), np.ones((some, 1), np.float32),
                    np.ones((some, 376), np.float32), np.ones(some, bool))
 buffer = ReplayBuffer(2 * some, layout)
 for _ in range(4):

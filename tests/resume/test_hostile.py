@@ -115,8 +115,8 @@ def test_a_file_larger_than_memory_is_not_read(stage, folder):
 
 
 WRONG_ARRAYS = {
-    "learner of another type": ("learner.safetensors", {".log_alpha": np.zeros((), np.float64)}),
-    "learner of another shape": ("learner.safetensors", {".actor": np.zeros(3, np.float32)}),
+    "learner of another type": ("learner.safetensors", {".temperature.weights": np.zeros((), np.float64)}),
+    "learner of another shape": ("learner.safetensors", {".actor.weights": np.zeros(3, np.float32)}),
     "learner with a part missing": ("learner.safetensors", {".key": None}),
     "window of another width": ("window.safetensors", {"metrics": np.zeros((2, 3), np.float32)}),
     "window of another type": ("window.safetensors", {"metrics": np.zeros((2, 9), np.float64)}),

@@ -128,9 +128,9 @@ def test_the_comparison_sees_one_changed_bit(straight, tmp_path):
 
     def restore(run, saved):
         restarted = real(run, saved)
-        actor = np.array(run.learner_state.actor)
+        actor = np.array(run.learner_state.actor.weights)
         actor[0] = np.nextafter(actor[0], np.float32(math.inf))
-        run.learner_state = run.learner_state._replace(actor=actor)
+        run.learner_state = run.learner_state._replace(actor=run.learner_state.actor._replace(weights=actor))
         return restarted
 
     with pytest.MonkeyPatch.context() as patch:

@@ -32,7 +32,7 @@ def short_segments(monkeypatch):
 def fill(replay: ReplayBuffer, count: int) -> None:
     """Add `count` transitions whose numbers tell which they are."""
     numbers = np.arange(replay.added, replay.added + count, dtype=np.float32)[:, None]
-    replay.add(Transitions(numbers.repeat(2, 1), numbers, numbers[:, 0], -numbers.repeat(2, 1), numbers[:, 0] % 2 == 0))
+    replay.add(Transitions(numbers.repeat(2, 1), numbers, numbers, -numbers.repeat(2, 1), numbers[:, 0] % 2 == 0))
 
 
 def content(step: int) -> Checkpoint:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from environments import tiny
 
-from saclab.algorithm.networks import NETWORKS
 from saclab.protocols import make_config
 from saclab.training.run import Run
 
@@ -46,6 +45,6 @@ def test_a_constant_reward_is_worth_itself_before_a_terminal_state_and_all_its_f
         ends += run.step()
     run.close()
     assert {episode.terminated for episode in ends} == {terminal}
-    q = NETWORKS["mlp"](2, (16,), 1, "relu").apply
-    values = [q(critic, np.array([1.0, 0.3], np.float32))[0] for critic in np.asarray(run.learner_state.critic)]
+    critics = np.asarray(run.learner_state.critic.weights)
+    values = [run.q_values(critic, np.array([1.0, 0.3], np.float32)) for critic in critics]
     assert values == pytest.approx([worth, worth], abs=0.1)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from saclab.algorithm.learner import make_learner
+from saclab.algorithm.scalars import scalars
 from saclab.config import AlgorithmSettings
 from saclab.environments.make import environment_spec, make_environment
 from saclab.protocols import make_config
@@ -48,10 +49,10 @@ def pendulum_bias(discount: float, shift: float) -> QBias:
     environment = make_environment("Pendulum-v1")
     spec = environment_spec("Pendulum-v1", environment)
     learner = make_learner(settings, spec.observation_size, spec.action_size)
-    state = learner.init(jax.random.PRNGKey(0))
-    critic = np.array(state.critic)
+    state = learner.init(scalars(settings, spec.action_size), jax.random.PRNGKey(0))
+    critic = np.array(state.critic.weights)
     critic[:, -1] += shift  # the last parameter is the output's bias
-    critics = Critics(learner.policy, np.array(state.actor), learner.q_network, critic, 0.2, discount)
+    critics = Critics(learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount)
     return measure_q_bias(critics, environment, spec, [1, 2], np.random.default_rng(0))
 
 

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from environments import tiny
 
-from saclab.algorithm.types import Metrics
 from saclab.config import TrainingSettings
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError
 from saclab.protocols import PROTOCOLS, make_config, training_settings
 from saclab.training import seeds
-from saclab.training.course import Counters
+from saclab.training.course import Counters, named_leaves
 from saclab.training.run import Run
 
 TINY = {
@@ -109,7 +108,7 @@ def test_parallel_environments_keep_the_ratio_of_updates_to_steps(count, shared_
     for number in range(1, 22):
         run.step()
         assert run.counters.steps == run.replay.added == number * count
-        assert run.counters.updates == max(0, number * count - 12) // 2 == int(run.learner_state.step)
+        assert run.counters.updates == max(0, number * count - 12) // 2 == int(run.learner_state.actor.moments.count)
         assert len(run.window) == run.counters.updates
     run.close()
 
@@ -122,23 +121,25 @@ def test_actions_are_uniform_during_the_random_steps_and_then_the_policys_and_al
         run.step()
     for _ in range(8):
         noise = stream.standard_normal((1, 1), np.float32)
-        expected.append(run.policy.act(np.asarray(run.learner_state.actor), run.environments.observation, noise))
+        expected.append(
+            run.policy.act(np.asarray(run.learner_state.actor.weights), run.environments.observation, noise)
+        )
         run.step()
     stored = run.replay.layout.unpack(run.replay.rows[:20])
     np.testing.assert_array_equal(stored.action, np.concatenate(expected))
     limit = tiny.TIME_LIMIT
     assert stored.observation[:, 1].tolist() == [n % limit for n in range(20)]
     assert stored.next_observation[:, 1].tolist() == [n % limit + 1 for n in range(20)]
-    assert stored.reward.tolist() == [n % limit + 1 for n in range(20)]
+    assert stored.reward_terms[:, 0].tolist() == [n % limit + 1 for n in range(20)]
     assert stored.terminated.tolist() == [0] * 20
     run.close()
 
 
 def test_another_seed_draws_everything_anew(shared_run):
     other = Run(dataclasses.replace(tiny_config(), seed=1))
-    for name in ("actor", "critic", "key"):
-        first, second = (np.asarray(getattr(some.learner_state, name)) for some in (shared_run, other))
-        assert not np.array_equal(first, second), name
+    ours, theirs = (named_leaves(some.learner_state) for some in (shared_run, other))
+    for name in (".actor.weights", ".critic.weights", ".key"):
+        assert not np.array_equal(ours[name], theirs[name]), name
     assert not np.array_equal(shared_run.environments.observation, other.environments.observation)
     for name in ("exploration", "sampling"):
         first, second = (getattr(some, name).bit_generator.state for some in (shared_run, other))
@@ -243,16 +244,16 @@ def test_the_share_done_is_that_of_the_nearest_limit(run):
 
 
 def test_an_update_that_is_not_finite_is_named_with_its_metrics(run):
-    good = np.zeros(len(Metrics._fields), np.float32)
-    bad = np.array([np.nan if name == "actor_loss" else 0 for name in Metrics._fields], np.float32)
+    good = np.zeros(len(run.metrics), np.float32)
+    bad = np.array([np.nan if name == "actor_loss" else 0 for name in run.metrics], np.float32)
     run.counters.updates = 10
     run.window = [good, good, bad, good]
     with pytest.raises(NonFiniteError, match=r"update 9 gave .* in actor_loss:"):
         run.window_array()
     run.window = [good, good]
-    assert run.window_array().shape == (2, len(Metrics._fields))
+    assert run.window_array().shape == (2, len(run.metrics))
     run.window = []
-    assert run.window_array().shape == (0, len(Metrics._fields))
+    assert run.window_array().shape == (0, len(run.metrics))
 
 
 @pytest.mark.parametrize("delay", [0, 1])
@@ -273,6 +274,6 @@ def test_the_policy_that_acts_is_as_many_rounds_behind_as_it_should(delay):
         else:
             run.step()
         if run.counters.updates // 2 > rounds:
-            after_rounds.append(np.array(run.learner_state.actor).tobytes())
+            after_rounds.append(np.array(run.learner_state.actor.weights).tobytes())
     assert len(set(after_rounds)) == 5
     run.close()

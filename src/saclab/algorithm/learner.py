@@ -8,172 +8,262 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 
-from saclab.algorithm import losses, targets
-from saclab.algorithm.networks import NETWORKS, Network
-from saclab.algorithm.numbers import Numbers, numbers_of
+from saclab.algorithm.heads import HEADS, CriticHead
+from saclab.algorithm.losses import actor_loss, temperature_loss
+from saclab.algorithm.networks import NETWORKS
+from saclab.algorithm.networks.network import Array, Network
+from saclab.algorithm.optimizer import Trainer, descend
 from saclab.algorithm.policy import Policy, make_policy
-from saclab.algorithm.temperature import TEMPERATURES, Temperature
-from saclab.algorithm.types import Batch, LearnerState, Metrics, Optimizers, TargetState
+from saclab.algorithm.scalars import Scalars
+from saclab.algorithm.targets import REDUCTIONS, averaged_entropy, averaged_prediction, polyak_update
+from saclab.algorithm.types import Batch, Context, LearnerState
 from saclab.config import AlgorithmSettings
+
+METRICS = {
+    "critic_loss": "The loss of the critics' head (Eq. 3), summed over the critics.",
+    "actor_loss": "Eq. 5: the paper's policy loss.",
+    "temperature_loss": "Eq. 8; 0 if the temperature is fixed.",
+    "temperature": "α as this update found it.",
+    "entropy": "Mean of −log π over the batch, in nats, for actions in [-1, 1].",
+    "q_mean": "Mean of the critics on the batch's actions.",
+    "q_spread": "Mean over the batch of the standard deviation between critics.",
+    "target_mean": "Mean of the critics' regression target.",
+    "snapshot_spread": "Mean over the batch of the standard deviation between the K snapshots' values; 0 for K = 1.",
+    "reward_scale": "What rewards were divided by.",
+}
+"""What an update may report: name -> meaning."""
+
+
+def metric_names(settings: AlgorithmSettings) -> tuple[str, ...]:
+    """What the updates of a variant report."""
+    return tuple(name for name in METRICS if name != "reward_scale" or settings.reward_scaling != "none")
 
 
 class Learner(NamedTuple):
     """A variant of SAC for one shape of observations and actions, as pure functions."""
 
-    init: Callable[[jax.Array], LearnerState]
+    init: Callable[[Scalars, jax.Array], LearnerState]
     """From a key u32[2] (`jax.random.PRNGKey`)."""
-    update: Callable[[LearnerState, Batch], tuple[LearnerState, Metrics]]
+    update: Callable[[Scalars, LearnerState, Batch, Context], LearnerState]
     """A body for jit and `lax.scan`; `jax.vmap` runs many learners at once."""
     policy: Policy
     """What `LearnerState.actor` parametrises."""
-    q_network: Network
-    """What each row of `LearnerState.critic` parametrises, on an observation and an action."""
+    q_values: Callable[..., Array]
+    """(one critic f32[P], *inputs) -> Q f32[...] for s and a in one array or in two, NumPy or JAX."""
+    metrics: tuple[str, ...]
+    """Names of the entries of `LearnerState.report`."""
 
 
 class Parts(NamedTuple):
     """The axis values that a variant is put together from."""
 
     settings: AlgorithmSettings
-    numbers: Numbers
     action_size: int
     policy: Policy
     q_network: Network
-    temperature: Temperature
-    actor_optimizer: optax.GradientTransformation
-    critic_optimizer: optax.GradientTransformation
+    head: CriticHead
+    actor_trainer: Trainer
+    critic_trainer: Trainer
+    temperature_trainer: Trainer
 
-    def q_values(self, critic: jax.Array, *state_and_action: jax.Array) -> jax.Array:
-        """Each critic's Q(s, a): f32[C, B] for critics f32[C, P], and s and a in one array or in two."""
-        q: jax.Array = jax.vmap(lambda parameters: self.q_network.apply(parameters, *state_and_action))(critic)
-        return jnp.squeeze(q, axis=-1)
+    def noise(self, observation: jax.Array, key: jax.Array) -> jax.Array:
+        """Standard normal, f32[B, A]."""
+        return jax.random.normal(key, (observation.shape[0], self.action_size))
 
-    def sample(self, actor: jax.Array, observation: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Actions f32[B, A] of the policy and their log-densities f32[B]."""
-        noise = jax.random.normal(key, (observation.shape[0], self.action_size))
-        return self.policy.sample(actor, observation, noise)
+    def q_outputs(self, critic: jax.Array, *state_and_action: jax.Array) -> jax.Array:
+        """Outputs f32[C, B, n] of critics f32[C, P] as they act, on s and a in one array or in two."""
+        each: Callable[[jax.Array], jax.Array] = jax.vmap(lambda row: self.q_network.apply(row, *state_and_action))
+        return each(critic)
+
+    def q(self, outputs: jax.Array) -> jax.Array:
+        """f32[...] for outputs f32[..., n] of the Q-network."""
+        q: jax.Array = self.head.mean(self.head.prediction(outputs))
+        return q
 
 
-def make_learner(
-    settings: AlgorithmSettings, observation_size: int, action_size: int, traced: Numbers | None = None
-) -> Learner:
+def make_learner(settings: AlgorithmSettings, observation_size: int, action_size: int) -> Learner:
     """The learner of `settings` for observations f32[observation_size] and actions f32[action_size] in [-1, 1].
 
-    Numbers that are `traced` take the place of those in `settings`: mapped over, they make a learner for each run.
+    Their plain numbers play no part: they are arguments of `init` and `update` (`scalars`).
     """
-    numbers = traced or numbers_of(settings, action_size)
-    policy = make_policy(settings, observation_size, action_size)
+    head, policy = HEADS[settings.critic_head](settings), make_policy(settings, observation_size, action_size)
+    q_network = NETWORKS[settings.network_of_critic](
+        observation_size + action_size, settings.layers_of_critic, head.outputs, settings.activation,
+        settings.weight_projection,
+    )  # fmt: skip
+    schedule = settings.learning_rate_schedule
     parts = Parts(
         settings=settings,
-        numbers=numbers,
         action_size=action_size,
-        policy=policy._replace(log_std_minimum=numbers.log_std_minimum, log_std_maximum=numbers.log_std_maximum),
-        q_network=NETWORKS[settings.network](
-            observation_size + action_size, settings.hidden_layers, 1, settings.activation
-        ),
-        temperature=TEMPERATURES["either" if traced else settings.temperature](settings, numbers),
-        actor_optimizer=optax.adam(numbers.actor_learning_rate),
-        critic_optimizer=optax.adam(numbers.critic_learning_rate),
+        policy=policy,
+        q_network=q_network,
+        head=head,
+        actor_trainer=Trainer("actor", schedule, policy.network.project),
+        critic_trainer=Trainer("critic", schedule, jax.vmap(q_network.project)),
+        temperature_trainer=Trainer("temperature", schedule),
     )
-    return Learner(partial(init, parts), partial(update, parts), parts.policy, parts.q_network)
+
+    def q_values(critic: Array, *state_and_action: Array) -> Array:
+        return parts.q(q_network.apply(critic, *state_and_action))
+
+    return Learner(partial(init, parts), partial(update, parts), policy, q_values, metric_names(settings))
 
 
-def side_by_side(state: jax.Array, action: jax.Array) -> jax.Array:
-    """One f32[B, O + A]: faster than two arrays where no gradient with respect to the action is wanted."""
-    return jnp.concatenate([state, action], axis=-1)
-
-
-def init(parts: Parts, key: jax.Array) -> LearnerState:
-    """The state before the first update."""
+def init(parts: Parts, numbers: Scalars, key: jax.Array) -> LearnerState:
+    """The state before the first update: every target snapshot is the critic, all entropy terms are zero."""
     actor_key, critic_key, update_key = jax.random.split(key, 3)
-    actor = parts.policy.network.init(actor_key)
-    critic = jax.vmap(parts.q_network.init)(jax.random.split(critic_key, parts.settings.critics))
-    log_alpha = jnp.log(jnp.asarray(parts.settings.initial_temperature, jnp.float32))
+    settings = parts.settings
+    critic = jax.vmap(parts.q_network.init)(jax.random.split(critic_key, settings.critics))
     return LearnerState(
-        actor=actor,
-        critic=critic,
-        target=targets.init_target(parts.settings, critic),
-        log_alpha=log_alpha,
-        optimizers=Optimizers(
-            actor=parts.actor_optimizer.init(actor),
-            critic=parts.critic_optimizer.init(critic),
-            temperature=parts.temperature.init(log_alpha),
-        ),
+        actor=parts.actor_trainer.start(parts.policy.network.init(actor_key)),
+        critic=parts.critic_trainer.start(critic),
+        temperature=parts.temperature_trainer.start(jnp.log(numbers["initial_temperature"])),
+        targets=jnp.repeat(critic[None], settings.snapshots, axis=0),
+        entropy_terms=jnp.zeros((settings.entropy_window, settings.batch_size), critic.dtype),
+        report=jnp.zeros(len(metric_names(settings)), critic.dtype),
         key=update_key,
-        step=jnp.zeros((), jnp.int32),
     )
 
 
-def update(parts: Parts, state: LearnerState, batch: Batch) -> tuple[LearnerState, Metrics]:
-    """One update of everything, in this order: critic, actor, temperature, targets."""
-    next_key, actor_key = jax.random.split(jax.random.fold_in(state.key, state.step))
-    alpha = jnp.exp(state.log_alpha)
+def update(parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, context: Context) -> LearnerState:
+    """One update of everything, in the variant's order: critic, actor, temperature, targets, unless it says another."""
+    key = jax.random.fold_in(state.key, context.step)
+    found = {"temperature": jnp.exp(state.temperature.weights), "reward_scale": context.reward_scale}
+    names = metric_names(parts.settings)
+    state = state._replace(report={name: found.get(name, state.report[place]) for place, name in enumerate(names)})
+    for name in parts.settings.update_order:
+        state = UPDATES[name](parts, numbers, state, batch, context, key)
+    return state._replace(report=jnp.stack([state.report[name] for name in names]))
 
-    critic, critic_moments, entropy_terms, critic_metrics = update_critic(parts, state, batch, alpha, next_key)
-    actor, actor_moments, log_prob, actor_loss = update_actor(parts, state, critic, batch, alpha, actor_key)
-    log_alpha, temperature_moments, temperature_loss = parts.temperature.update(
-        state.log_alpha, state.optimizers.temperature, log_prob
-    )
-    snapshots = targets.follow(parts.numbers, state.target.snapshots, critic, state.step)
 
-    next_state = LearnerState(
-        actor=actor,
-        critic=critic,
-        target=TargetState(snapshots, entropy_terms),
-        log_alpha=log_alpha,
-        optimizers=Optimizers(actor_moments, critic_moments, temperature_moments),
-        key=state.key,
-        step=state.step + 1,
-    )
-    metrics = Metrics(
-        actor_loss=actor_loss,
-        temperature_loss=temperature_loss,
-        temperature=alpha,
-        entropy=-jnp.mean(log_prob),
-        **critic_metrics,
-    )
-    return next_state, metrics
+Passes = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+Update = Callable[[Parts, Scalars, LearnerState, Batch, Context, jax.Array], LearnerState]
 
 
 def update_critic(
-    parts: Parts, state: LearnerState, batch: Batch, alpha: jax.Array, key: jax.Array
-) -> tuple[jax.Array, optax.OptState, jax.Array, dict[str, jax.Array]]:
-    """Eq. 3 with the value of Eq. 4 or 9: the new critics, their moments, the entropy terms, and metrics."""
-    next_action, next_log_prob = parts.sample(state.actor, batch.next_observation, key)
-    next_q = jax.vmap(parts.q_values, in_axes=(0, None))(
-        state.target.snapshots, side_by_side(batch.next_observation, next_action)
+    parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, context: Context, key: jax.Array
+) -> LearnerState:
+    """Eq. 3 with the value of Eq. 4 or 9."""
+    key, _ = jax.random.split(key)
+    next_noise = parts.noise(batch.next_observation, key)
+    next_action, next_log_prob = parts.policy.sample(state.actor.weights, batch.next_observation, next_noise)
+    entropy_term, entropy_terms = averaged_entropy(
+        state.entropy_terms, jnp.exp(state.temperature.weights) * next_log_prob, context.step
     )
-    next_value = targets.next_value(parts.settings, state.target, next_q, alpha * next_log_prob, state.step)
-    target = losses.critic_target(batch.reward, batch.terminated, next_value.value, parts.numbers.discount)
+    reward = jnp.sum(batch.reward_terms * context.reward_weights, axis=1) / context.reward_scale
+    discount = numbers["discount"] * (1 - batch.terminated)
 
-    def objective(critic: jax.Array) -> tuple[jax.Array, jax.Array]:
-        q = parts.q_values(critic, side_by_side(batch.observation, batch.action))
-        return losses.critic_loss(q, target), q
+    def objective(critic: jax.Array) -> tuple[jax.Array, tuple[jax.Array, dict[str, jax.Array]]]:
+        outputs, next_outputs, statistics = forward(parts, critic, state.targets, batch, next_action, key)
+        predictions = parts.head.prediction(next_outputs)
+        reduce = REDUCTIONS[parts.settings.target_reduction]
+        prediction, snapshot_spread = averaged_prediction(predictions, parts.head.mean, reduce)
+        target = jax.lax.stop_gradient(parts.head.backup(prediction, reward, discount, entropy_term))
+        loss, q = parts.head.loss(outputs, target), parts.q(outputs)
+        report = {
+            "critic_loss": loss,
+            "q_mean": jnp.mean(q),
+            "q_spread": jnp.mean(jnp.std(q, axis=0)),
+            "target_mean": jnp.mean(parts.head.mean(target)),
+            "snapshot_spread": snapshot_spread,
+        }
+        return loss, (statistics, report)
 
-    (loss, q), gradient = jax.value_and_grad(objective, has_aux=True)(state.critic)
-    change, moments = parts.critic_optimizer.update(gradient, state.optimizers.critic)
-    metrics = {
-        "critic_loss": loss,
-        "q_mean": jnp.mean(q),
-        "q_spread": jnp.mean(jnp.std(q, axis=0)),
-        "target_mean": jnp.mean(target),
-        "snapshot_spread": next_value.snapshot_spread,
-    }
-    return state.critic + change, moments, next_value.entropy_terms, metrics
+    critic, (statistics, report) = descend(parts.critic_trainer, numbers, objective, state.critic)
+    critic = critic._replace(weights=parts.q_network.remember(critic.weights, statistics))
+    return state._replace(critic=critic, entropy_terms=entropy_terms, report=state.report | report)
+
+
+def forward(
+    parts: Parts, critic: jax.Array, targets: jax.Array, batch: Batch, next_action: jax.Array, key: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """All passes of the Q-networks that a critic's update needs.
+
+    Returns:
+        The critics' outputs f32[C, B, n] on (s, a); those on (s′, a′) of each target snapshot, or of the critics
+        themselves where there is none, f32[K or 1, C, B, n]; the critics' running statistics f32[C, S] that follow.
+    """
+    now = jnp.concatenate([batch.observation, batch.action], axis=1)  # in one array: no gradient of the action is due
+    then = jnp.concatenate([batch.next_observation, next_action], axis=1)
+    passes: Passes = jax.vmap(lambda critic, inputs: parts.q_network.train(critic, inputs, key=key), in_axes=(0, None))
+    of_targets: Passes = jax.vmap(passes, in_axes=(0, None))
+    if not parts.settings.joint_forward:
+        outputs, statistics = passes(critic, now)
+        next_outputs, _ = of_targets(targets if len(targets) else critic[None], then)
+        return outputs, next_outputs, statistics
+    both, size = jnp.concatenate([now, then]), len(now)
+    outputs, statistics = passes(critic, both)
+    next_outputs = of_targets(targets, both)[0][..., size:, :] if len(targets) else outputs[None, :, size:]
+    return outputs[:, :size], next_outputs, statistics
 
 
 def update_actor(
-    parts: Parts, state: LearnerState, critic: jax.Array, batch: Batch, alpha: jax.Array, key: jax.Array
-) -> tuple[jax.Array, optax.OptState, jax.Array, jax.Array]:
-    """Eq. 5 on the new critics: the new actor, its moments, log π f32[B] of the old actor, and the loss."""
-    reduce = targets.REDUCTIONS[parts.settings.actor_reduction]
+    parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, context: Context, key: jax.Array
+) -> LearnerState:
+    """Eq. 5 on the critics as they are now."""
+    _, key = jax.random.split(key)
+    reduce, alpha = REDUCTIONS[parts.settings.actor_reduction], jnp.exp(state.temperature.weights)
+    noise = parts.noise(batch.observation, key)
 
-    def objective(actor: jax.Array) -> tuple[jax.Array, jax.Array]:
-        action, log_prob = parts.sample(actor, batch.observation, key)
-        q = reduce(parts.q_values(critic, batch.observation, action))
-        return losses.actor_loss(log_prob, q, alpha), log_prob
+    def objective(actor: jax.Array) -> tuple[jax.Array, tuple[jax.Array, dict[str, jax.Array]]]:
+        action, log_prob, statistics = parts.policy.train_sample(actor, batch.observation, noise, key)
+        q = parts.q(parts.q_outputs(state.critic.weights, batch.observation, action))
+        loss = actor_loss(log_prob, reduce(q[..., None], q)[:, 0], alpha)
+        return loss, (statistics, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)})
 
-    (loss, log_prob), gradient = jax.value_and_grad(objective, has_aux=True)(state.actor)
-    change, moments = parts.actor_optimizer.update(gradient, state.optimizers.actor)
-    return state.actor + change, moments, log_prob, loss
+    actor, (statistics, report) = descend(parts.actor_trainer, numbers, objective, state.actor)
+    actor = actor._replace(weights=parts.policy.network.remember(actor.weights, statistics))
+    return state._replace(actor=actor, report=state.report | report)
+
+
+def update_temperature(
+    parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, context: Context, key: jax.Array
+) -> LearnerState:
+    """Eq. 8, by the entropy of the policy as the actor's update found it."""
+
+    def objective(log_alpha: jax.Array) -> tuple[jax.Array, jax.Array]:
+        factor = parts.settings.temperature_gradient
+        loss = temperature_loss(log_alpha, state.report["entropy"], numbers["target_entropy"], factor)
+        return loss, loss
+
+    temperature, loss = descend(parts.temperature_trainer, numbers, objective, state.temperature)
+    learned = numbers["temperature_learning_rate"] > 0
+    report = state.report | {"temperature_loss": jnp.where(learned, loss, 0)}
+    return state._replace(temperature=temperature, report=report)
+
+
+def update_targets(
+    parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, context: Context, key: jax.Array
+) -> LearnerState:
+    """Eq. 2 on the newest snapshot."""
+    rate, interval = numbers["polyak_rate"], numbers["snapshot_interval"]
+    return state._replace(targets=polyak_update(state.targets, state.critic.weights, rate, interval, context.step))
+
+
+def at_intervals(part: Update) -> Update:
+    """`part`, in every `actor_interval`-th update."""
+
+    def update_or_not(
+        parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, context: Context, key: jax.Array
+    ) -> LearnerState:
+        interval = parts.settings.actor_interval
+        if interval == 1:
+            return part(parts, numbers, state, batch, context, key)
+        changed: LearnerState = jax.lax.cond(
+            context.step % interval == 0,
+            lambda same: part(parts, numbers, same, batch, context, key),
+            lambda same: same,
+            state,
+        )
+        return changed
+
+    return update_or_not
+
+
+UPDATES: dict[str, Update] = {
+    "critic": update_critic,
+    "actor": at_intervals(update_actor),
+    "temperature": at_intervals(update_temperature),
+    "targets": update_targets,
+}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from saclab.algorithm.networks import NETWORKS, Array, Network
+from saclab.algorithm.networks import NETWORKS
+from saclab.algorithm.networks.network import Array, Network
 from saclab.config import AlgorithmSettings
 
 
@@ -18,7 +19,9 @@ class Policy(NamedTuple):
 
     def distribution(self, parameters: Array, observation: Array) -> tuple[Array, Array]:
         """Mean and log standard deviation before the tanh: two f32[..., A] for f32[..., O]."""
-        output = self.network.apply(parameters, observation)
+        return self._distribution(self.network.apply(parameters, observation))
+
+    def _distribution(self, output: Array) -> tuple[Array, Array]:
         xp = output.__array_namespace__()
         size = output.shape[-1] // 2
         return output[..., :size], xp.clip(output[..., size:], self.log_std_minimum, self.log_std_maximum)
@@ -39,6 +42,11 @@ class Policy(NamedTuple):
         mean, log_std = self.distribution(parameters, observation)
         return squash(mean, log_std, noise)
 
+    def train_sample(self, parameters: Array, observation: Array, noise: Array, key: Array) -> tuple[Array, ...]:
+        """As `sample`, while the network learns; also the running statistics f32[S] that follow."""
+        output, statistics = self.network.train(parameters, observation, key=key)
+        return *squash(*self._distribution(output), noise), statistics
+
 
 def squash(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
     """tanh(mean + std·noise) and its log-density (Eq. 14, with the change of variables of the tanh).
@@ -55,5 +63,7 @@ def squash(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
 
 def make_policy(settings: AlgorithmSettings, observation_size: int, action_size: int) -> Policy:
     """The policy for observations f32[..., observation_size] and actions f32[..., action_size]."""
-    network = NETWORKS[settings.network](observation_size, settings.hidden_layers, 2 * action_size, settings.activation)
+    network = NETWORKS[settings.network](
+        observation_size, settings.hidden_layers, 2 * action_size, settings.activation, settings.weight_projection
+    )
     return Policy(network, settings.log_std_minimum, settings.log_std_maximum)

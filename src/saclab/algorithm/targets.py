@@ -6,72 +6,69 @@ K = 1 is plain SAC and takes the same path.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from saclab.algorithm.numbers import Numbers
-from saclab.algorithm.types import TargetState
-from saclab.config import AlgorithmSettings
-
-REDUCTIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
-    # f32[C, B] -> f32[B]
-    "minimum": lambda q: jnp.min(q, axis=0),
-    "mean": lambda q: jnp.mean(q, axis=0),
-}
+Step = jax.Array | np.int32
+Reduction = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-class NextValue(NamedTuple):
-    value: jax.Array
-    """f32[B]: V(s′)."""
-    entropy_terms: jax.Array
-    """f32[W, B]: the ring after this minibatch."""
-    snapshot_spread: jax.Array
-    """f32[]: mean over the batch of the standard deviation between snapshots."""
+def minimum(predictions: jax.Array, q: jax.Array) -> jax.Array:
+    """The whole prediction of the critic with the smallest Q."""
+    smallest = jnp.argmin(q, axis=0)[None] == jnp.arange(len(q))[:, None]
+    return jnp.sum(jnp.where(smallest[..., None], predictions, 0), axis=0)
 
 
-def init_target(settings: AlgorithmSettings, critic: jax.Array) -> TargetState:
-    """All K snapshots start as the critic f32[C, P]; the entropy terms start at zero."""
-    return TargetState(
-        snapshots=jnp.repeat(critic[None], settings.snapshots, axis=0),
-        entropy_terms=jnp.zeros((settings.entropy_window, settings.batch_size), critic.dtype),
-    )
+def mean(predictions: jax.Array, q: jax.Array) -> jax.Array:
+    return jnp.mean(predictions, axis=0)
 
 
-def next_value(
-    settings: AlgorithmSettings, target: TargetState, q: jax.Array, entropy_term: jax.Array, step: jax.Array
-) -> NextValue:
-    """V(s′) = mean over k of [reduction over i of Q_ki(s′, a′)] − α log π(a′|s′)   (Eq. 4, Eq. 9).
+REDUCTIONS: dict[str, Reduction] = {"minimum": minimum, "mean": mean}
+"""Name -> (predictions f32[C, B, n], their Q f32[C, B]) -> f32[B, n]."""
+
+
+def averaged_prediction(
+    predictions: jax.Array, to_q: Callable[[jax.Array], jax.Array], reduce: Reduction
+) -> tuple[jax.Array, jax.Array]:
+    """The mean over k of [reduction over i of Z_ki(s′, a′)] (Eq. 4 and 9, without the entropy).
 
     Args:
-        settings: the axes of the variant.
-        target: the state before this update.
-        q: f32[K, C, B], each snapshot's critics on the same next states and actions.
-        entropy_term: f32[B], α log π(a′|s′) of this minibatch.
-        step: i32[], updates made before this one.
+        predictions: f32[K, C, B, n], each snapshot's critics on the same next states and actions.
+        to_q: prediction f32[..., n] -> Q f32[...].
+        reduce: one of REDUCTIONS.
+
+    Returns:
+        The prediction f32[B, n], and the mean over the batch of the standard deviation between the snapshots' Q f32[].
     """
-    reduced = jax.vmap(REDUCTIONS[settings.target_reduction])(q)
-    entropy_terms = target.entropy_terms.at[step % settings.entropy_window].set(entropy_term)
-    return NextValue(
-        value=jnp.mean(reduced, axis=0) - jnp.mean(entropy_terms, axis=0),
-        entropy_terms=entropy_terms,
-        snapshot_spread=jnp.mean(jnp.std(reduced, axis=0)),
-    )
+    reduced = jax.vmap(reduce)(predictions, to_q(predictions))
+    return jnp.mean(reduced, axis=0), jnp.mean(jnp.std(to_q(reduced), axis=0))
 
 
-def live_slot(numbers: Numbers, snapshots: int, step: jax.Array) -> jax.Array:
+def averaged_entropy(entropy_terms: jax.Array, entropy_term: jax.Array, step: Step) -> tuple[jax.Array, jax.Array]:
+    """The mean over the last W minibatches of α log π, row by row, and the ring f32[W, B] after this one.
+
+    W = 1 is plain SAC: the term f32[B] of this minibatch itself.
+    """
+    entropy_terms = entropy_terms.at[step % len(entropy_terms)].set(entropy_term)
+    return jnp.mean(entropy_terms, axis=0), entropy_terms
+
+
+def live_slot(snapshots: int, interval: jax.Array, step: Step) -> jax.Array:
     """The slot, in a ring of `snapshots`, of the target that follows the critic after `step` updates."""
-    slot: jax.Array = (step // numbers.snapshot_interval) % snapshots
+    slot: jax.Array = (step // interval) % snapshots
     return slot
 
 
-def follow(numbers: Numbers, snapshots: jax.Array, critic: jax.Array, step: jax.Array) -> jax.Array:
-    """Eq. 2 on the live target: θ̄ ← (1 − τ) θ̄ + τ θ.
+def polyak_update(targets: jax.Array, critic: jax.Array, rate: jax.Array, interval: jax.Array, step: Step) -> jax.Array:
+    """Eq. 2 on the live target: θ̄ ← (1 − τ) θ̄ + τ θ, in the ring f32[K, C, P].
 
-    The result becomes the live target after step + 1 updates. Every `snapshot_interval` updates that is a new
-    slot, and the value before stays behind as a snapshot; otherwise it takes the place of the value before.
+    The result becomes the live target after step + 1 updates. Every `interval` updates that is a new slot, and the
+    value before stays behind as a snapshot; otherwise it takes the place of the value before.
     """
-    live = jnp.take(snapshots, live_slot(numbers, len(snapshots), step), axis=0)
-    moved = (1 - numbers.polyak_rate) * live + numbers.polyak_rate * critic
-    return snapshots.at[live_slot(numbers, len(snapshots), step + 1)].set(moved)
+    if len(targets) == 0:
+        return targets
+    live = jnp.take(targets, live_slot(len(targets), interval, step), axis=0)
+    moved = (1 - rate) * live + rate * critic
+    return targets.at[live_slot(len(targets), interval, step + 1)].set(moved)

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from saclab.algorithm.numbers import Numbers, numbers_of
-from saclab.algorithm.types import LearnerState
+from saclab.algorithm.scalars import scalars
+from saclab.algorithm.types import Context, LearnerState
 from saclab.batch.frames import Message
-from saclab.batch.member import Member, MemberReplay, init_settings
+from saclab.batch.member import Member, MemberReplay
 from saclab.batch.pool import EnvironmentPool, error_of
 from saclab.batch.program import Program
-from saclab.config import Config
+from saclab.config import Config, structure
 from saclab.environments.make import EnvironmentSpec, environment_spec, make_environment
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken
@@ -64,7 +64,7 @@ class Batch:
         self.spec = spec_of(self.config)
         self.layout = RowLayout(self.spec.observation_size, self.spec.action_size)
         self.program = program_of(
-            init_settings(self.config.algorithm), self.layout, training.parallel_environments, max(slots, len(configs))
+            structure(self.config.algorithm), self.layout, training.parallel_environments, max(slots, len(configs))
         )
         require_memory(
             training.replay_capacity, self.layout, self.program.slots, "--batch", memory_of_devices(self.program)
@@ -72,8 +72,12 @@ class Batch:
         self.steps = self.updates = 0
         self.members = [Member(self, slot, config) for slot, config in enumerate(configs)]
         self.pool = EnvironmentPool(configs, self.spec, workers)
-        numbers = [numbers_of(config.algorithm, self.spec.action_size) for config in configs]
-        self.numbers = self._put_stacked([number_arrays(each) for each in numbers])
+        self.numbers = self._put_stacked(
+            [scalars(config.algorithm, self.spec.action_size, config.planned_updates) for config in configs]
+        )
+        slots_taken = self.program.slots
+        self.reward_weights = self.program.put(np.ones((slots_taken, self.layout.reward_terms), np.float32))
+        self.reward_scale = self.program.put(np.ones(slots_taken, np.float32))
         self.replay: jax.Array = self._empty_replay()
         self.experience: Experience | None = None
         self.undelivered: list[jax.Array] = []
@@ -163,9 +167,11 @@ class Batch:
             learner = member.learner()
             header = {
                 "do": "q_bias", "run": member.slot, "evaluations": member.counters.evaluations,
-                "alpha": float(np.exp(learner.log_alpha)),
+                "alpha": float(np.exp(learner.temperature.weights)),
             }  # fmt: skip
-            jobs.append((header, {"actor": np.asarray(learner.actor), "critic": np.asarray(learner.critic)}))
+            jobs.append(
+                (header, {"actor": np.asarray(learner.actor.weights), "critic": np.asarray(learner.critic.weights)})
+            )
         replies = self.pool.work_off(jobs, lambda: False)
         return {
             member.slot: QBias(*reply["bias"]) if "bias" in reply else error_of(reply["failure"], {})
@@ -183,7 +189,7 @@ class Batch:
         """f32[S, P], copied once after each update."""
         self.flush()
         if self._host_actors is None:
-            self._host_actors = np.array(self.state.actor)
+            self._host_actors = np.array(self.state.actor.weights)
         return self._host_actors
 
     def flush(self) -> None:
@@ -237,7 +243,7 @@ class Batch:
             parts |= {"observation": observations, "noise": noise}
         packed = self.program.put(self.program.arrival(updates).pack(self.program.slots, **parts))
         if updates:
-            self.actor_before = self.state.actor
+            self.actor_before = self.state.actor.weights
         delayed = self.config.training.acting_delay > 0
         actions = self._act(packed) if delayed and noise is not None else None
         if self.experience is not None:
@@ -245,18 +251,21 @@ class Batch:
         return self._act(packed) if noise is not None and not delayed else actions
 
     def _act(self, packed: jax.Array) -> jax.Array:
-        actions: jax.Array = self.program.act(self.numbers, self.acting, packed)
+        actions: jax.Array = self.program.act(self.acting, packed)
         return actions
 
     @property
     def acting(self) -> jax.Array:
         """f32[S, P]: as `Course.acting`, of all slots."""
         if self.config.training.acting_delay == 0 or self.actor_before is None:
-            return self.state.actor
+            return self.state.actor.weights
         return self.actor_before
 
     def _advance(self, updates: int, packed: jax.Array) -> None:
-        self.state, self.replay, metrics = self.program.advance(updates, self.numbers, self.state, self.replay, packed)
+        context = Context(np.int32(self.updates - updates), self.reward_weights, self.reward_scale)
+        self.state, self.replay, metrics = self.program.advance(
+            updates, self.numbers, self.state, self.replay, packed, context
+        )
         self.experience = self._host = self._host_actors = None
         if updates:
             self.undelivered.append(metrics)
@@ -298,12 +307,6 @@ program_of = lru_cache(maxsize=4)(Program)  # batches of one grid mostly have th
 def set_slot(replay: jax.Array, slot: int, rows: np.ndarray) -> jax.Array:
     """f32[S, capacity, width] with the rows f32[capacity, width] of one slot put in their place."""
     return replay.at[slot].set(rows)
-
-
-def number_arrays(numbers: Numbers) -> Numbers:
-    """Each of the same type for all runs, also where a user has written 1 for 1.0."""
-    kinds = {"temperature_learned": np.bool_, "snapshot_interval": np.int32}
-    return Numbers(**{name: kinds.get(name, np.float32)(number) for name, number in numbers._asdict().items()})
 
 
 def joined(replies: Sequence[Message]) -> EvaluationEpisodes | RunBroken:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
-import optax
 
-from saclab.algorithm.numbers import Numbers
+from saclab.algorithm.scalars import scalars
 from saclab.algorithm.types import LearnerState
-from saclab.config import AlgorithmSettings, Config, field_names
+from saclab.config import Config, structure
 from saclab.training import seeds
 from saclab.training.course import Course
 from saclab.training.run import compiled_init
@@ -35,14 +33,15 @@ class Member(Course):
         self.batch, self.slot, self.spec = batch, slot, batch.spec
         self.active = True
         self.replay: Any = MemberReplay(batch, slot)
-        alone = compiled_init(init_settings(config.algorithm), batch.layout)(seeds.learner_key(config.seed))
-        self.before_begin = BeforeBegin(of_batch(alone), None)
+        numbers = scalars(config.algorithm, batch.spec.action_size, config.planned_updates)
+        init = compiled_init(structure(config.algorithm), batch.layout)
+        self.before_begin = BeforeBegin(init(numbers, seeds.learner_key(config.seed)), None)
 
     @property
     def actor(self) -> np.ndarray:
         if self._begun:
             return np.array(self.batch.actors_on_host()[self.slot])
-        return np.asarray(self.before_begin.learner.actor)
+        return np.asarray(self.before_begin.learner.actor.weights)
 
     @property
     def acting(self) -> np.ndarray:
@@ -64,12 +63,12 @@ class Member(Course):
 
     def learner(self) -> LearnerState:
         if not self._begun:
-            return alone(self.before_begin.learner, self.config.algorithm)
-        mine = jax.tree.map(lambda leaf: leaf[self.slot], self.batch.on_host())
-        return alone(mine, self.config.algorithm)
+            return self.before_begin.learner
+        mine: LearnerState = jax.tree.map(lambda leaf: leaf[self.slot], self.batch.on_host())
+        return mine
 
     def take_learner(self, state: LearnerState, acting: np.ndarray | None) -> None:
-        self.before_begin = BeforeBegin(of_batch(state), acting)
+        self.before_begin = BeforeBegin(state, acting)
 
     def capture_environments(self) -> list[dict[str, Any] | None]:
         return self.batch.pool.capture(self.slot)
@@ -105,25 +104,3 @@ class MemberReplay:
         """As of an array f32[capacity, width]."""
         self.batch.flush()
         return np.asarray(self.batch.replay[self.slot, key])
-
-
-def of_batch(state: LearnerState) -> LearnerState:
-    """A run's state as the program takes it: with Adam's moments for the temperature, even if it is fixed."""
-    moments = state.optimizers.temperature
-    if isinstance(moments, optax.EmptyState):
-        moments = optax.adam(0.0).init(np.float32(0))
-    return state._replace(optimizers=state.optimizers._replace(temperature=moments))
-
-
-def alone(state: LearnerState, settings: AlgorithmSettings) -> LearnerState:
-    """The inverse of `of_batch`."""
-    if settings.temperature == "learned":
-        return state
-    return state._replace(optimizers=state.optimizers._replace(temperature=optax.EmptyState()))
-
-
-def init_settings(settings: AlgorithmSettings) -> AlgorithmSettings:
-    """The same for all runs that start from their keys in the same way, so that this is compiled once for them."""
-    plain = AlgorithmSettings()
-    unused = set(Numbers._fields) & set(field_names(AlgorithmSettings))
-    return dataclasses.replace(settings, **{name: getattr(plain, name) for name in unused})

@@ -21,12 +21,13 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from saclab.algorithm.learner import make_learner
-from saclab.algorithm.numbers import Numbers
-from saclab.algorithm.types import LearnerState
+from saclab.algorithm.scalars import Scalars
+from saclab.algorithm.types import Context, LearnerState, Trained
 from saclab.config import AlgorithmSettings
 from saclab.replay import RowLayout
 
 RUNS: Any = PartitionSpec("runs")  # type: ignore[no-untyped-call]
+SHARED: Any = PartitionSpec()  # type: ignore[no-untyped-call]
 UNROLLED_UPDATES = 4  # of one call; more are a loop, which compiles sooner
 
 
@@ -78,7 +79,7 @@ class Program:
         """For at least `slots` slots: as many as can be spread evenly over the devices.
 
         Args:
-            settings: of any run of the batch; its plain numbers play no part.
+            settings: the structure of the runs' settings.
             layout: of the transitions.
             environments: of each run.
             slots: how many runs there may be.
@@ -87,7 +88,8 @@ class Program:
         devices = jax.devices()
         self.slots = -(-slots // len(devices)) * len(devices)
         self.mesh = Mesh(np.array(devices), ("runs",))
-        self.act = self._mapped(self._act, donated=())
+        self.learner = make_learner(settings, layout.observation_size, layout.action_size)
+        self.act = self._mapped(self._act, (RUNS, RUNS), donated=())
         self._advance: dict[int, Callable[..., Any]] = {}
 
     @cached_property
@@ -102,55 +104,71 @@ class Program:
         return Arrival(self.layout, self.environments, updates, self.settings.batch_size)
 
     def advance(
-        self, updates: int, numbers: Numbers, state: LearnerState, replay: jax.Array, packed: jax.Array
+        self,
+        updates: int,
+        numbers: Scalars,
+        state: LearnerState,
+        replay: jax.Array,
+        packed: jax.Array,
+        context: Context,
     ) -> tuple[LearnerState, jax.Array, jax.Array]:
         """Store transitions and make `updates` updates: the learners, replay, and metrics f32[S, U, M].
+
+        `context` is that of the first update: step i32[], which all share, weights f32[S, T] and scale f32[S].
 
         `replay` f32[S, capacity, width] is used up, and so is the state, but for the actor: it may act for longer.
         """
         if updates not in self._advance:
 
             def advance(
-                numbers: Numbers, actor: jax.Array, others: dict[str, Any], replay: jax.Array, packed: jax.Array
-            ) -> Any:
-                return self._advance_slot(updates, numbers, LearnerState(actor=actor, **others), replay, packed)
+                numbers: Scalars, actor: jax.Array, others: dict[str, Any], replay: jax.Array, packed: jax.Array,
+                context: Context,
+            ) -> Any:  # fmt: skip
+                state = LearnerState(**others | {"actor": Trained(actor, others["actor"])})
+                return self._advance_slot(updates, numbers, state, replay, packed, context)
 
-            self._advance[updates] = self._mapped(advance, donated=(2, 3))
-        others = state._asdict()
-        actor = others.pop("actor")
+            specs = (RUNS, RUNS, RUNS, RUNS, RUNS, Context(step=SHARED, reward_weights=RUNS, reward_scale=RUNS))
+            self._advance[updates] = self._mapped(advance, specs, donated=(2, 3))
+        actor, others = state.actor.weights, state._asdict() | {"actor": state.actor.moments}
         result: tuple[LearnerState, jax.Array, jax.Array] = self._advance[updates](
-            numbers, actor, others, replay, packed
+            numbers, actor, others, replay, packed, context
         )
         return result
 
-    def _act(self, numbers: Numbers, actor: jax.Array, packed: jax.Array) -> jax.Array:
+    def _act(self, actor: jax.Array, packed: jax.Array) -> jax.Array:
         """Actions f32[E, A] of one slot."""
         arrival = self.arrival(0)
-        policy = self._learner(numbers).policy
-        action: jax.Array = policy.act(actor, arrival.unpack(packed, "observation"), arrival.unpack(packed, "noise"))
+        observation, noise = arrival.unpack(packed, "observation"), arrival.unpack(packed, "noise")
+        action: jax.Array = self.learner.policy.act(actor, observation, noise)
         return action
 
     def _advance_slot(
-        self, updates: int, numbers: Numbers, state: LearnerState, replay: jax.Array, packed: jax.Array
+        self,
+        updates: int,
+        numbers: Scalars,
+        state: LearnerState,
+        replay: jax.Array,
+        packed: jax.Array,
+        context: Context,
     ) -> tuple[LearnerState, jax.Array, jax.Array]:
         arrival = self.arrival(updates)
         positions = (arrival.unpack(packed, "position") + jnp.arange(self.environments)) % len(replay)
         replay = replay.at[positions].set(arrival.unpack(packed, "rows"))
-        learner = self._learner(numbers)
 
-        def update(state: LearnerState, drawn: jax.Array) -> tuple[LearnerState, jax.Array]:
-            state, metrics = learner.update(state, self.layout.unpack(replay[drawn]))
-            return state, jnp.stack(metrics)
+        def update(state: LearnerState, inputs: tuple[jax.Array, jax.Array]) -> tuple[LearnerState, jax.Array]:
+            drawn, step = inputs
+            batch = self.layout.unpack(replay[drawn])
+            state = self.learner.update(numbers, state, batch, context._replace(step=step))
+            return state, state.report
 
-        drawn = arrival.unpack(packed, "drawn")
+        drawn, steps = arrival.unpack(packed, "drawn"), context.step + jnp.arange(updates, dtype=jnp.int32)
         unrolled = updates if 0 < updates <= UNROLLED_UPDATES else 1
-        state, metrics = jax.lax.scan(update, state, drawn, unroll=unrolled)
+        state, metrics = jax.lax.scan(update, state, (drawn, steps), unroll=unrolled)
         return state, replay, metrics
 
-    def _learner(self, numbers: Numbers) -> Any:
-        return make_learner(self.settings, self.layout.observation_size, self.layout.action_size, numbers)
-
-    def _mapped(self, function: Callable[..., Any], donated: tuple[int, ...]) -> Callable[..., Any]:
-        """Map over the slots, each device over its own."""
-        over_devices = jax.shard_map(jax.vmap(function), mesh=self.mesh, in_specs=RUNS, out_specs=RUNS, check_vma=False)
+    def _mapped(self, function: Callable[..., Any], specs: Any, donated: tuple[int, ...]) -> Callable[..., Any]:
+        """Map over the slots, each device over its own; what is SHARED is the same for all."""
+        axes = jax.tree.map(lambda spec: None if spec is SHARED else 0, specs)
+        over_slots = jax.vmap(function, in_axes=axes)
+        over_devices = jax.shard_map(over_slots, mesh=self.mesh, in_specs=specs, out_specs=RUNS, check_vma=False)
         return jax.jit(over_devices, donate_argnums=donated)

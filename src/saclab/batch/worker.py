@@ -118,7 +118,7 @@ class EnvironmentWorker:
         config, number = self.configs[header["run"]], header["evaluations"]
         learner = self._learner(header["run"])
         critics = Critics(
-            learner.policy, arrays["actor"], learner.q_network, arrays["critic"], header["alpha"],
+            learner.policy, arrays["actor"], learner.q_values, arrays["critic"], header["alpha"],
             config.algorithm.discount,
         )  # fmt: skip
         try:

@@ -19,8 +19,8 @@ class Transitions(NamedTuple):
     """f32[N, O]."""
     action: np.ndarray
     """f32[N, A] in [-1, 1]."""
-    reward: np.ndarray
-    """f32[N]."""
+    reward_terms: np.ndarray
+    """f32[N, T]: what the reward is the weighted sum of; T = 1 is the reward itself."""
     next_observation: np.ndarray
     """f32[N, O]: what the action led to, also where the episode ended; never the next episode's first one."""
     terminated: np.ndarray
@@ -75,7 +75,7 @@ class TrainingEnvironments:
                 self._start_episode(index)
             else:
                 self.observation[index] = seen
-        return Transitions(observation, action, reward, next_observation, terminated), ended
+        return Transitions(observation, action, reward[:, None], next_observation, terminated), ended
 
     def close(self) -> None:
         for environment in self.environments:

@@ -7,8 +7,8 @@ import json
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from saclab.algorithm.numbers import Numbers
 from saclab.config import Config
+from saclab.config import structure as algorithm_structure
 from saclab.grid.plan import Cell
 from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
 from saclab.training.run_folder import FAILURE
@@ -32,11 +32,7 @@ class Group(NamedTuple):
 
 def structure(config: Config) -> str:
     """What the runs of a batch have in common: everything but the seed, plain numbers and when a run is tested."""
-    algorithm = {
-        name: value
-        for name, value in dataclasses.asdict(config.algorithm).items()
-        if name not in (*Numbers._fields, "temperature", "initial_temperature")
-    }
+    algorithm = dataclasses.asdict(algorithm_structure(config.algorithm))
     training = {name: value for name, value in dataclasses.asdict(config.training).items() if name not in FREE}
     return json.dumps([config.environment, config.environment_arguments, algorithm, training], sort_keys=True)
 

@@ -31,8 +31,9 @@ from saclab.errors import TrainingFailed
 from saclab.files import sync, write_bytes
 from saclab.machine import available_memory
 from saclab.replay import ReplayBuffer
+from saclab.training import format_1
 
-FORMAT = 1
+FORMAT, OLDEST_FORMAT = 2, 1
 KEPT = 2
 SEGMENT_ROWS = 8192
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
@@ -53,6 +54,8 @@ class Checkpoint(NamedTuple):
     """Group -> name -> array."""
     state: dict[str, Any]
     """JSON-able."""
+    format: int = FORMAT
+    """As it was written; the groups are as of today."""
 
 
 def save_checkpoint(
@@ -166,7 +169,12 @@ def write_files(folder: Path, checkpoint: Checkpoint, replay: ReplayBuffer, link
     manifest = {
         "format": FORMAT,
         "files": files,
-        "replay": {"added": replay.added, "capacity": replay.capacity, "segment_rows": SEGMENT_ROWS},
+        "replay": {
+            "added": replay.added,
+            "capacity": replay.capacity,
+            "segment_rows": SEGMENT_ROWS,
+            "columns": replay.layout.columns,
+        },
         "state": checkpoint.state,
     }
     content = json.dumps(manifest, indent=1).encode()
@@ -246,9 +254,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{MANIFEST} is not JSON: {error}") from error
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        found = manifest.get("format") if isinstance(manifest, dict) else None
-        raise CheckpointError(f"it has format {found!r}, and this version of saclab reads format {FORMAT}")
+    if not isinstance(manifest, dict):
+        raise CheckpointError(f"{MANIFEST} is not what saclab writes")
+    found = manifest.get("format")
+    if type(found) is not int or not OLDEST_FORMAT <= found <= FORMAT:
+        raise CheckpointError(
+            f"it has format {found!r}, and this version of saclab reads formats {OLDEST_FORMAT} to {FORMAT}"
+        )
     require_parts(manifest)
     return manifest
 
@@ -277,6 +289,9 @@ def read_checkpoint(folder: Path, replay: ReplayBuffer) -> Checkpoint:
     buffer = manifest["replay"]
     if buffer["capacity"] != replay.capacity:
         raise CheckpointError(f"its replay capacity is {buffer['capacity']}, not {replay.capacity}")
+    columns = replay.layout.columns
+    if manifest["format"] > 1 and buffer.get("columns") != columns:
+        raise CheckpointError(f"the columns of its transitions are {buffer.get('columns')!r}, not {columns}")
     size, length = min(buffer["added"], replay.capacity), max(1, buffer["segment_rows"])
     starts = {f"replay-{index:04d}.safetensors": start for index, start in enumerate(range(0, size, length))}
     replay_files = {name for name in manifest["files"] if name.startswith("replay-")}
@@ -294,7 +309,9 @@ def read_checkpoint(folder: Path, replay: ReplayBuffer) -> Checkpoint:
         else:
             groups[name.removesuffix(".safetensors")] = arrays
     replay.added = buffer["added"]
-    return Checkpoint(groups, manifest["state"])
+    if manifest["format"] == 1:
+        groups["learner"] = format_1.today(groups.get("learner", {}))
+    return Checkpoint(groups, manifest["state"], manifest["format"])
 
 
 def read_arrays(folder: Path, name: str, entry: dict[str, Any]) -> Arrays:

@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from saclab.algorithm.types import LearnerState, Metrics
+from saclab.algorithm.learner import metric_names
+from saclab.algorithm.types import LearnerState
 from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
@@ -57,6 +58,7 @@ class Course(ABC):
         self.exploration = seeds.generator(config.seed, "exploration")
         self.sampling = seeds.generator(config.seed, "replay")
         self.counters = Counters()
+        self.metrics = metric_names(config.algorithm)
         self.window: list[Any] = []
         """Metrics f32[M] of the updates since the last line of metrics.jsonl."""
         self.best_actor: np.ndarray | None = None
@@ -190,12 +192,12 @@ class Course(ABC):
             NonFiniteError: names the first update and the metrics that are not finite.
         """
         if not self.window:
-            return np.zeros((0, len(Metrics._fields)), np.float32)
+            return np.zeros((0, len(self.metrics)), np.float32)
         values: np.ndarray = np.stack([np.asarray(metrics) for metrics in self.window])
         broken = ~np.isfinite(values)
         if broken.any():
             first = int(np.flatnonzero(broken.any(axis=1))[0])
-            names = [name for name, bad in zip(Metrics._fields, broken[first], strict=True) if bad]
+            names = [name for name, bad in zip(self.metrics, broken[first], strict=True) if bad]
             raise NonFiniteError(
                 f"update {self.counters.updates - len(values) + first + 1} gave a value that is not finite in "
                 f"{', '.join(names)}: lower the learning rates, or look at the scale of the environment's rewards"
@@ -210,7 +212,7 @@ class Course(ABC):
         """
         learner = {name: np.asarray(leaf) for name, leaf in named_leaves(self.learner()).items()}
         for name, array in learner.items():
-            zero_temperature = name == ".log_alpha" and array == -np.inf
+            zero_temperature = name == ".temperature.weights" and array == -np.inf
             if not (np.isfinite(array).all() or zero_temperature):
                 raise NonFiniteError(f"after update {self.counters.updates} {name} is not finite")
         environment_arrays, environment_states = split_arrays(self.capture_environments())
@@ -237,10 +239,10 @@ class Course(ABC):
         Raises:
             CheckpointError: if it is not one of a run with this configuration.
         """
-        groups, state = checkpoint
+        groups, state, _ = checkpoint
         self._restore_learner(groups)
         window = groups.get("window", {}).get("metrics", np.zeros(0))
-        expected = np.zeros((*window.shape[:1], len(Metrics._fields)), np.float32)
+        expected = np.zeros((*window.shape[:1], len(self.metrics)), np.float32)
         self.window = list(require_like("metrics", window, expected))
         if "best" in groups:
             self.best_actor = require_like("best", groups["best"].get("actor"), self.actor)
@@ -270,5 +272,5 @@ class Course(ABC):
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """The arrays of a pytree by their path, such as `.optimizers.actor[0].mu`."""
+    """The arrays of a pytree by their path, such as `.actor.moments.mu`."""
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}

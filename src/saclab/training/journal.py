@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from saclab.algorithm.types import Metrics
 from saclab.config import Config
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken, UserError
@@ -18,6 +17,7 @@ from saclab.files import write_json
 from saclab.machine import different_facts
 from saclab.trained_policy import save_policy
 from saclab.training.captured import part, plain_numbers
+from saclab.training.checkpoint import FORMAT as CHECKPOINT_FORMAT
 from saclab.training.checkpoint import Checkpoint, CheckpointError, newest_first, save_checkpoint
 from saclab.training.course import Course
 from saclab.training.evaluation import EvaluationEpisodes
@@ -74,6 +74,11 @@ class Journal:
                 f"the exact state of {self.run.config.environment} cannot be captured: environments {restarted} "
                 "started a new episode, so this run is not bit for bit what it would have been"
             )
+        if checkpoint.format != CHECKPOINT_FORMAT:
+            self.notes.append(
+                f"the checkpoint has format {checkpoint.format}, of an earlier saclab: from here on the results differ "
+                "in the last bits from what they would have been"
+            )
         self.notes += different_facts(checkpoint.state.get("facts"), self.facts)
         self._write_best()
 
@@ -118,7 +123,7 @@ class Journal:
             return
         values = run.window_array().mean(axis=0, dtype="float64")
         run.window = []
-        means = dict(zip(Metrics._fields, values.tolist(), strict=True))
+        means = dict(zip(run.metrics, values.tolist(), strict=True))
         self.logs.metrics({"updates": counters.updates, "steps": counters.steps, **means, "seconds": self._seconds()})
         yield UpdatesLogged(counters.steps, counters.updates, means)
         yield from self._watch_temperature(means["temperature"])

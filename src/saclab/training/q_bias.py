@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saclab.algorithm.networks import Network
+from saclab.algorithm.networks.network import Array
 from saclab.algorithm.policy import Policy
 from saclab.environments.make import EnvironmentSpec
 
@@ -27,7 +27,8 @@ class Critics(NamedTuple):
     policy: Policy
     actor: np.ndarray
     """f32[P]."""
-    q_network: Network
+    q_values: Callable[..., Array]
+    """(one critic f32[P], inputs f32[n, O + A]) -> Q f32[n]."""
     critic: np.ndarray
     """f32[C, P]."""
     alpha: float
@@ -36,7 +37,7 @@ class Critics(NamedTuple):
     def q(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
         """The smallest of the critics, as the policy sees it: f32[n] for f32[n, O] and f32[n, A]."""
         inputs = np.concatenate([observation, action], axis=1)
-        smallest: np.ndarray = np.min([self.q_network.apply(row, inputs)[:, 0] for row in self.critic], axis=0)
+        smallest: np.ndarray = np.min([self.q_values(row, inputs) for row in self.critic], axis=0)
         return smallest
 
 

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from saclab.algorithm.learner import make_learner
-from saclab.algorithm.types import LearnerState
-from saclab.config import AlgorithmSettings, Config
+from saclab.algorithm.scalars import Scalars, scalars
+from saclab.algorithm.types import Context, LearnerState
+from saclab.config import AlgorithmSettings, Config, structure
 from saclab.environments.vector import EndedEpisode, TrainingEnvironments
 from saclab.errors import NonFiniteError
 from saclab.replay import ReplayBuffer, RowLayout, require_memory
@@ -43,9 +44,14 @@ class Run(Course):
         self.evaluator = Evaluator(config.environment, config.environment_arguments)
 
         learner = make_learner(algorithm, self.spec.observation_size, self.spec.action_size)
-        self.policy, self.q_network = learner.policy, learner.q_network
-        self.learner_state: LearnerState = compiled_init(algorithm, layout)(seeds.learner_key(config.seed))
-        self.update = compiled_update(algorithm, layout)
+        self.policy, self.q_values = learner.policy, learner.q_values
+        self.numbers: Scalars = jax.tree.map(
+            jnp.asarray, scalars(algorithm, self.spec.action_size, config.planned_updates)
+        )
+        self.context = Context(np.int32(0), jnp.ones(layout.reward_terms), jnp.float32(1))
+        shape = structure(algorithm)
+        self.learner_state: LearnerState = compiled_init(shape, layout)(self.numbers, seeds.learner_key(config.seed))
+        self.update = compiled_update(shape, layout)
         self._actor: np.ndarray | None = None
         self._actor_before: np.ndarray | None = None
 
@@ -53,7 +59,7 @@ class Run(Course):
     def actor(self) -> np.ndarray:
         """The policy's parameters f32[P] on the host, copied once per update."""
         if self._actor is None:
-            self._actor = np.array(self.learner_state.actor)
+            self._actor = np.array(self.learner_state.actor.weights)
         return self._actor
 
     @property
@@ -76,7 +82,8 @@ class Run(Course):
             self._actor_before = self.actor
         while self.counters.updates < updates_due:
             rows = self.replay.sample(self.sampling, self.config.algorithm.batch_size)
-            self.learner_state, metrics = self.update(self.learner_state, rows)
+            context = self.context._replace(step=np.int32(self.counters.updates))
+            self.learner_state, metrics = self.update(self.numbers, self.learner_state, rows, context)
             self.window.append(metrics)
             self.counters.updates += 1
             self._actor = None
@@ -112,8 +119,8 @@ class Run(Course):
         if count == 0:
             return None
         critics = Critics(
-            self.policy, self.actor, self.q_network, np.array(self.learner_state.critic),
-            float(np.exp(np.asarray(self.learner_state.log_alpha))), self.config.algorithm.discount,
+            self.policy, self.actor, self.q_values, np.array(self.learner_state.critic.weights),
+            float(np.exp(np.asarray(self.learner_state.temperature.weights))), self.config.algorithm.discount,
         )  # fmt: skip
         return measure_q_bias(
             critics, self.evaluator.environments[0], self.spec,
@@ -144,20 +151,22 @@ class Run(Course):
 
 
 @lru_cache(maxsize=16)
-def compiled_init(settings: AlgorithmSettings, layout: RowLayout) -> Callable[[np.ndarray], LearnerState]:
-    """Key u32[2] -> the state before the first update, compiled once."""
-    return jax.jit(make_learner(settings, layout.observation_size, layout.action_size).init)
+def compiled_init(shape: AlgorithmSettings, layout: RowLayout) -> Callable[[Scalars, np.ndarray], LearnerState]:
+    """(plain numbers, key u32[2]) -> the state before the first update; compiled once for settings of a `structure`."""
+    return jax.jit(make_learner(shape, layout.observation_size, layout.action_size).init)
 
 
 @lru_cache(maxsize=16)
 def compiled_update(
-    settings: AlgorithmSettings, layout: RowLayout
-) -> Callable[[LearnerState, np.ndarray], tuple[LearnerState, jax.Array]]:
-    """(state, rows f32[B, width]) -> (state, metrics f32[M]), compiled once; the state given is used up."""
-    learner = make_learner(settings, layout.observation_size, layout.action_size)
+    shape: AlgorithmSettings, layout: RowLayout
+) -> Callable[[Scalars, LearnerState, np.ndarray, Context], tuple[LearnerState, jax.Array]]:
+    """(plain numbers, state, rows f32[B, width], context) -> (state, report f32[M]); the state given is used up."""
+    learner = make_learner(shape, layout.observation_size, layout.action_size)
 
-    def update(state: LearnerState, rows: jax.Array) -> tuple[LearnerState, jax.Array]:
-        state, metrics = learner.update(state, layout.unpack(rows))
-        return state, jnp.stack(metrics)
+    def update(
+        numbers: Scalars, state: LearnerState, rows: jax.Array, context: Context
+    ) -> tuple[LearnerState, jax.Array]:
+        state = learner.update(numbers, state, layout.unpack(rows), context)
+        return state, state.report
 
-    return jax.jit(update, donate_argnums=0)
+    return jax.jit(update, donate_argnums=1)

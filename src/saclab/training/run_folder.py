@@ -19,7 +19,7 @@ import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -83,7 +83,7 @@ def fits(value: object, hint: Any) -> bool:
         return value in arguments
     if kind is tuple:
         return isinstance(value, tuple) and all(fits(part, arguments[0]) for part in value)
-    if kind is UnionType:
+    if kind in (Union, UnionType):
         return any(fits(value, argument) for argument in arguments)
     if hint is float:
         return type(value) in (int, float)
@@ -219,7 +219,7 @@ class RunRecord(NamedTuple):
     episodes: dict[str, np.ndarray]
     """The columns of EPISODE_COLUMNS, episodes of the random steps left out."""
     metrics: dict[str, np.ndarray]
-    """updates, steps, seconds and the fields of Metrics, each averaged over a window of updates."""
+    """updates, steps, seconds and what the variant reports, each averaged over a window of updates."""
     q_bias: dict[str, np.ndarray]
     """The columns of Q_BIAS_COLUMNS; empty arrays if it was not measured."""
     result: dict[str, Any] | None

@@ -1,0 +1,96 @@
+"""What a network is: pure functions on one packed vector of numbers.
+
+One vector per network keeps the learner's state at a dozen arrays: Polyak averaging, Adam, the ring of target
+snapshots and a checkpoint are each one array, and a call into XLA has few arguments. `apply` takes NumPy arrays
+as well as JAX arrays (the array API standard), so a policy acts on the CPU without a call into JAX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import reduce
+from itertools import accumulate
+from operator import add
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+Array = Any  # a NumPy or a JAX array of the kind given
+
+
+class Network(NamedTuple):
+    """Functions on a vector f32[P]: parameters, and behind them S running statistics.
+
+    The inputs f32[..., I] may come as several arrays that belong side by side. A network may let each meet its own rows
+    of the first layer, so that a gradient with respect to one of them costs nothing for the others.
+    """
+
+    init: Callable[[jax.Array], jax.Array]
+    """From a key."""
+    apply: Callable[..., Array]
+    """(f32[P], *inputs) -> f32[..., outputs], as the network acts: with its running statistics."""
+    train: Callable[..., tuple[jax.Array, jax.Array]]
+    """(f32[P], *inputs, key) -> f32[B, outputs] as it learns, with the statistics of this batch and dropout where it
+    has them, and the running statistics f32[S] that follow."""
+    project: Callable[[jax.Array], jax.Array]
+    """f32[P] -> f32[P], after each step of the optimizer."""
+    size: int
+    """P, the statistics counted in."""
+    statistics: int = 0
+    """S."""
+
+    def remember(self, vector: jax.Array, statistics: jax.Array) -> jax.Array:
+        """`vector` f32[..., P] with these running statistics f32[..., S]."""
+        if self.statistics == 0:
+            return vector
+        return vector.at[..., self.size - self.statistics :].set(statistics)
+
+
+def relu(x: Array) -> Array:
+    return x.__array_namespace__().where(x > 0, x, 0)
+
+
+def elu(x: Array) -> Array:
+    xp = x.__array_namespace__()
+    return xp.where(x > 0, x, xp.expm1(xp.minimum(x, 0)))
+
+
+def silu(x: Array) -> Array:
+    xp = x.__array_namespace__()
+    return x * 0.5 * (1 + xp.tanh(0.5 * x))
+
+
+def gelu(x: Array) -> Array:
+    """The tanh approximation."""
+    xp = x.__array_namespace__()
+    return 0.5 * x * (1 + xp.tanh(0.7978845608 * (x + 0.044715 * x * x * x)))
+
+
+def tanh(x: Array) -> Array:
+    return x.__array_namespace__().tanh(x)
+
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "relu": relu, "tanh": tanh, "elu": elu, "silu": silu, "gelu": gelu,
+}  # fmt: skip
+
+
+def product(inputs: tuple[Array, ...], weights: Array) -> Array:
+    """[input_1, input_2, …] @ weights, without putting the inputs into one array."""
+    ends = accumulate(part.shape[-1] for part in inputs)
+    return reduce(add, (part @ weights[end - part.shape[-1] : end] for part, end in zip(inputs, ends, strict=True)))
+
+
+def split(vector: Array, sizes: tuple[int, ...]) -> list[Array]:
+    """The parts of a packed vector. The gradient of one split is one concatenation; of as many slices it would be a
+    sum of padded vectors.
+    """
+    *boundaries, _ = accumulate(sizes)
+    parts: list[Array] = vector.__array_namespace__().split(vector, boundaries)
+    return parts
+
+
+def unit_columns(weights: jax.Array) -> jax.Array:
+    """f32[I, O] with the weights into each unit scaled to length 1."""
+    return weights / jnp.maximum(jnp.linalg.norm(weights, axis=0, keepdims=True), 1e-8)

@@ -1,0 +1,158 @@
+"""The networks: by hand, against finite differences, and the same in NumPy and in JAX."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from saclab.algorithm.networks import NETWORKS
+from saclab.algorithm.networks.batch_norm_mlp import EPSILON, MOMENTUM, batch_norm_mlp, normalise
+from saclab.algorithm.networks.network import ACTIVATIONS
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_an_activation_is_the_one_of_its_name(name):
+    x = np.linspace(-5, 5, 101, dtype=np.float32)
+    known = {"relu": jax.nn.relu, "tanh": jnp.tanh, "elu": jax.nn.elu, "silu": jax.nn.silu, "gelu": jax.nn.gelu}
+    np.testing.assert_allclose(ACTIVATIONS[name](x), known[name](x), rtol=1e-5, atol=1e-6)
+
+
+def test_an_mlp_by_hand():
+    network = NETWORKS["mlp"](2, (2,), 1, "relu", "none")
+    #              [[1, -1], [2, 0]]      [0, 3]     [[1], [-2]]  [0.5]
+    parameters = np.array([1.0, -1.0, 2.0, 0.0, 0.0, 3.0, 1.0, -2.0, 0.5])
+    assert network.size == len(parameters)
+    # (1, 1): hidden 3, 2 -> 3 - 4 + 0.5;   (-1, 0): hidden -1 -> 0, 4 -> -8 + 0.5
+    assert network.apply(parameters, np.array([[1.0, 1.0], [-1.0, 0.0]])).tolist() == [[-0.5], [-7.5]]
+
+
+def test_inputs_that_belong_side_by_side_may_come_apart():
+    network = NETWORKS["mlp"](3, (5,), 2, "tanh", "none")
+    parameters = np.asarray(network.init(jax.random.PRNGKey(0)))
+    x = np.random.default_rng(0).standard_normal((4, 3)).astype(np.float32)
+    whole = network.apply(parameters, x)
+    np.testing.assert_allclose(network.apply(parameters, x[:, :2], x[:, 2:]), whole, rtol=1e-5)
+
+    def total(*inputs):
+        return jnp.sum(network.apply(jnp.asarray(parameters), *inputs))
+
+    np.testing.assert_allclose(jax.grad(total, 1)(x[:, :2], x[:, 2:]), jax.grad(total)(x)[:, 2:], rtol=1e-5)
+
+
+def test_weights_and_biases_start_uniform_within_one_over_the_root_of_the_inputs():
+    network = NETWORKS["mlp"](100, (400,), 1, "relu", "none")
+    first = np.asarray(network.init(jax.random.PRNGKey(0)))[: 101 * 400]
+    assert np.abs(first).max() == pytest.approx(0.1, rel=1e-3)
+    assert first.std() == pytest.approx(0.1 / math.sqrt(3), rel=0.02)
+    assert abs(first.mean()) < 0.001
+
+
+KEY = jax.random.PRNGKey(0)
+
+
+def random_vector(network, seed: int = 0) -> np.ndarray:
+    """Parameters and statistics away from their start; the variances stay above zero."""
+    vector = np.random.default_rng(seed).normal(0, 0.5, network.size).astype(np.float32)
+    return np.where(np.arange(network.size) >= network.size - network.statistics, np.abs(vector) + 0.5, vector)
+
+
+def batch(rows: int = 6) -> np.ndarray:
+    return np.random.default_rng(1).normal(1.0, 2.0, (rows, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("projection", ["none", "unit_columns"])
+def test_a_network_has_the_shapes_it_says(name, projection):
+    network = NETWORKS[name](3, (5, 4), 2, "relu", projection)
+    vector = network.init(KEY)
+    outputs, statistics = network.train(vector, batch(), key=KEY)
+    assert vector.shape == network.project(vector).shape == (network.size,)
+    assert outputs.shape == network.apply(vector, batch()).shape == (6, 2)
+    assert statistics.shape == (network.statistics,)
+    assert network.remember(vector, statistics).shape == vector.shape
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_acts_the_same_in_numpy_and_in_jax(name):
+    network = NETWORKS[name](3, (5, 4), 2, "elu", "none")
+    vector = random_vector(network)
+    ours = network.apply(vector, batch())
+    assert isinstance(ours, np.ndarray)
+    np.testing.assert_allclose(ours, network.apply(jnp.asarray(vector), jnp.asarray(batch())), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_unit_columns_have_length_one_and_leave_the_rest(name):
+    network = NETWORKS[name](3, (4,), 2, "relu", "unit_columns")
+    vector = random_vector(network)
+    first = np.asarray(network.project(vector))[:12].reshape(3, 4)
+    np.testing.assert_allclose((first**2).sum(axis=0), 1, rtol=1e-5)
+    np.testing.assert_allclose(
+        first, vector[:12].reshape(3, 4) / np.sqrt((vector[:12].reshape(3, 4) ** 2).sum(0)), rtol=1e-5
+    )
+    kept = slice(network.size - network.statistics, network.size)
+    np.testing.assert_array_equal(np.asarray(network.project(vector))[kept], vector[kept])
+
+
+def test_joint_statistics_by_hand():
+    x = jnp.array([[0.0], [2.0], [10.0], [12.0]])  # s = 0, 2 and s' = 10, 12: mean 6, variance 26
+    normalised = normalise(x, x.mean(0), x.var(0), jnp.ones(1), jnp.zeros(1))
+    np.testing.assert_allclose(normalised[:, 0], [-1.177, -0.784, 0.784, 1.177], atol=1e-3)
+
+
+def test_running_statistics_move_by_one_hundredth():
+    network = batch_norm_mlp(3, (4,), 1, "relu")
+    _, statistics = network.train(network.init(KEY), batch(), key=KEY)
+    inputs = np.asarray(statistics[:6]).reshape(2, 3)  # of the inputs; they start at 0 and 1
+    np.testing.assert_allclose(inputs[0], (1 - MOMENTUM) * batch().mean(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(inputs[1], MOMENTUM + (1 - MOMENTUM) * batch().var(axis=0), rtol=1e-4)
+
+
+def test_with_the_statistics_of_its_batch_a_network_acts_as_it_learns():
+    network = batch_norm_mlp(3, (4,), 2, "relu")
+    vector = random_vector(network)
+    learning, statistics = network.train(vector, batch(), key=KEY)
+    running = vector[network.size - network.statistics :]
+    of_batch = (np.asarray(statistics) - MOMENTUM * running) / (1 - MOMENTUM)
+    acting = network.apply(network.remember(jnp.asarray(vector), jnp.asarray(of_batch)), jnp.asarray(batch()))
+    np.testing.assert_allclose(acting, learning, rtol=2e-3, atol=2e-3)
+
+
+def straight_line(vector: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """batch_norm_mlp(3, (4,), 2) while it learns, in 64 bits, written out."""
+
+    def norm(x, scale, bias):
+        centred = x - x.mean(axis=0)
+        return centred / np.sqrt((centred**2).mean(axis=0) + EPSILON) * scale + bias
+
+    first, second, last_bias, vector = vector[:12], vector[12:20], vector[20:22], vector[22:]
+    x = norm(x, vector[:3], vector[3:6]) @ first.reshape(3, 4)
+    x = np.maximum(norm(x, vector[6:10], vector[10:14]), 0)
+    return x @ second.reshape(4, 2) + last_bias
+
+
+def test_batch_normalisation_and_its_gradient_equal_a_straight_line_reference():
+    network = batch_norm_mlp(3, (4,), 2, "relu")
+    vector, x = random_vector(network).astype(np.float64), batch().astype(np.float64)
+    weight = np.random.default_rng(2).standard_normal((6, 2))
+    parameters = network.size - network.statistics
+
+    def loss(vector):
+        return (straight_line(vector, x) * weight).sum()
+
+    def ours(vector):
+        return jnp.sum(network.train(vector, batch(), key=KEY)[0] * weight.astype(np.float32))
+
+    np.testing.assert_allclose(network.train(vector.astype(np.float32), batch(), key=KEY)[0], straight_line(vector, x),
+                               rtol=1e-4, atol=1e-5)  # fmt: skip
+    slope = np.asarray(jax.grad(ours)(jnp.asarray(vector, jnp.float32)))
+    for index in range(parameters):
+        change = np.zeros_like(vector)
+        change[index] = 1e-6
+        expected = (loss(vector + change) - loss(vector - change)) / 2e-6
+        assert slope[index] == pytest.approx(expected, rel=1e-3, abs=1e-3), index
+    assert not slope[parameters:].any()  # no gradient goes through the running statistics

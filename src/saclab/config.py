@@ -121,6 +121,11 @@ class AlgorithmSettings:
     longest_noise: int = 1
     """Most steps for which one draw of the exploration noise is held; how many, n, is drawn with a probability
     proportional to n⁻². 1 is a draw for each step."""
+    reward_terms: tuple[str, ...] = ()
+    """Names of reward terms in the `info` of an environment's step; what they leave of the reward is a term too."""
+    reward_weights: Annotated[tuple[float, ...], PLAIN_NUMBER] = ()
+    """The weight of each of `reward_terms` in the reward that is learned from; the remainder's is 1. None given: 1 for
+    each. Evaluations always count the environment's own reward."""
     reward_scaling: Literal["none", "deviation", "deviation_or_bound"] = "none"
     """What rewards are divided by when a batch is drawn: nothing, the running standard deviation of the discounted
     return, or the larger of it and the largest discounted return so far divided by `critic_bound`."""
@@ -185,6 +190,11 @@ def require_possible(settings: AlgorithmSettings) -> None:
         settings.critic_head != "categorical" or settings.entropy_window == 1,
         "entropy_window", settings.entropy_window,
         "use 1 together with critic_head categorical: it averages numbers, not distributions",
+    )  # fmt: skip
+    require(
+        len(settings.reward_weights) in (0, len(settings.reward_terms)),
+        "reward_weights", " ".join(map(str, settings.reward_weights)),
+        f"give one for each of the {len(settings.reward_terms)} reward_terms, or none",
     )  # fmt: skip
     order = settings.update_order
     require(

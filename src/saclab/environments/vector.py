@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from saclab.environments.make import environment_spec, make_environment
+from saclab.environments.reward_terms import split_reward
 from saclab.environments.simulator import capture_state, restore_state
 from saclab.errors import NonFiniteError
 
@@ -37,8 +38,18 @@ class EndedEpisode(NamedTuple):
 class TrainingEnvironments:
     """N environments, each always inside an episode: the one after an end starts at once."""
 
-    def __init__(self, environment: str, arguments: Mapping[str, Any], seeds: list[int]) -> None:
-        """Make one environment per seed and start its first episode."""
+    def __init__(
+        self, environment: str, arguments: Mapping[str, Any], seeds: list[int], reward_terms: Sequence[str] = ()
+    ) -> None:
+        """Make one environment per seed and start its first episode.
+
+        Args:
+            environment: Gymnasium id.
+            arguments: its keyword arguments.
+            seeds: of the first episodes.
+            reward_terms: names in the `info` of a step; what they leave of the reward is the last term.
+        """
+        self.reward_terms = tuple(reward_terms)
         self.name = environment
         self.environments = [make_environment(environment, arguments) for _ in seeds]
         self.spec = environment_spec(environment, self.environments[0])
@@ -59,15 +70,16 @@ class TrainingEnvironments:
             NonFiniteError: if an environment gives an observation or a reward that is not finite.
         """
         observation = self.observation.copy()
-        reward = np.zeros(len(self), np.float32)
+        reward_terms = np.zeros((len(self), len(self.reward_terms) + 1), np.float32)
         next_observation = np.empty_like(observation)
         terminated = np.zeros(len(self), bool)
         ended = []
         scaled = self.spec.scale_action(action)
         for index, environment in enumerate(self.environments):
-            seen, gained, terminated[index], truncated, _ = environment.step(scaled[index])
-            next_observation[index], reward[index] = seen, gained
-            self._require_finite(index, next_observation[index], float(reward[index]), scaled[index])
+            seen, gained, terminated[index], truncated, info = environment.step(scaled[index])
+            next_observation[index] = seen
+            self._require_finite(index, next_observation[index], float(np.float32(gained)), scaled[index])
+            reward_terms[index] = split_reward(self.name, gained, info, self.reward_terms)
             self.total_rewards[index] += float(gained)
             self.lengths[index] += 1
             if terminated[index] or truncated:
@@ -75,7 +87,7 @@ class TrainingEnvironments:
                 self._start_episode(index)
             else:
                 self.observation[index] = seen
-        return Transitions(observation, action, reward[:, None], next_observation, terminated), ended
+        return Transitions(observation, action, reward_terms, next_observation, terminated), ended
 
     def close(self) -> None:
         for environment in self.environments:

@@ -1,0 +1,38 @@
+"""The terms that a reward is the sum of, as an environment tells them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, SupportsFloat
+
+import numpy as np
+
+from saclab.errors import NonFiniteError, SettingError
+
+
+def split_reward(
+    environment: str, reward: SupportsFloat, info: Mapping[str, Any], names: Sequence[str]
+) -> tuple[float, ...]:
+    """The named terms of one step, and the remainder: their sum is the reward, up to rounding.
+
+    Args:
+        environment: its id, for errors.
+        reward: what the step gave.
+        info: what the step told beside it, such as `reward_forward` and `reward_ctrl`.
+        names: of the terms; none leaves the reward itself as the only term.
+
+    Raises:
+        SettingError: if the step does not tell a term.
+        NonFiniteError: if a term is not finite.
+    """
+    terms = []
+    for name in names:
+        if name not in info:
+            known = ", ".join(key for key, value in info.items() if np.ndim(value) == 0) or "none"
+            raise SettingError(
+                "reward_terms", name, f"{environment} does not tell it in the info of a step: it tells {known}"
+            )
+        terms.append(float(info[name]))
+        if not np.isfinite(terms[-1]):
+            raise NonFiniteError(f"{environment} gave the reward term {name} = {terms[-1]}")
+    return *terms, float(reward) - sum(terms)

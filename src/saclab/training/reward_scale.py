@@ -1,0 +1,72 @@
+"""What rewards are divided by: running statistics of the discounted return of the training episodes.
+
+As in SimbaV2, XQC and FlashSAC, rewards are stored as they came and divided when a batch is drawn, so that every
+stored transition has today's scale.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from saclab.training.captured import require_like
+from saclab.training.checkpoint import Arrays
+
+EPSILON = 1e-8
+FIRST_COUNT = 1e-4  # of the start's variance of 1
+
+
+class RewardScale:
+    """Of one run, over its N environments."""
+
+    def __init__(self, kind: str, environments: int, discount: float, bound: float) -> None:
+        """The state before the first step.
+
+        Args:
+            kind: the setting `reward_scaling`.
+            environments: N.
+            discount: γ of the returns.
+            bound: the largest return that the critics can represent.
+        """
+        self.kind, self.discount, self.bound = kind, discount, bound
+        self.returns = np.zeros(environments)
+        """f64[N]: G, discounted from each episode's start."""
+        self.moments = np.array([FIRST_COUNT, 0.0, 1.0])
+        """f64[3]: count, mean and variance of G over all steps."""
+        self.largest = np.zeros(1)
+        """f64[1]: the largest |G|."""
+
+    def enter(self, reward: np.ndarray, ended: np.ndarray) -> None:
+        """Take in the rewards f32[N] of a step and whether an episode ended with it bool[N].
+
+        G ← γ (1 − ended) G + r, as the authors of SimbaV2 have it: the last step of an episode forgets those before.
+        """
+        if self.kind == "none":
+            return
+        self.returns = self.discount * (1 - ended) * self.returns + reward
+        count, mean, variance = self.moments
+        seen, total = len(reward), count + len(reward)
+        shift = self.returns.mean() - mean
+        squares = count * variance + seen * self.returns.var() + shift**2 * count * seen / total
+        self.moments = np.array([total, mean + shift * seen / total, squares / total])
+        self.largest = np.maximum(self.largest, np.abs(self.returns).max())
+
+    @property
+    def value(self) -> np.float32:
+        """By which rewards are divided now."""
+        if self.kind == "none":
+            return np.float32(1)
+        variance = self.moments[2]
+        if self.kind == "deviation":
+            return np.float32(np.sqrt(variance) + EPSILON)
+        return np.float32(max(np.sqrt(variance + EPSILON), self.largest[0] / self.bound))
+
+    def capture(self) -> Arrays:
+        """Empty if nothing is scaled."""
+        if self.kind == "none":
+            return {}
+        return {"returns": self.returns, "moments": self.moments, "largest": self.largest}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Continue from `capture`; raises CheckpointError for what it cannot have given."""
+        for name, now in self.capture().items():
+            setattr(self, name, require_like(f"the reward scale's {name}", arrays.get(name), now))

@@ -1,0 +1,51 @@
+"""What a reward is made of: by hand, and on real environments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from saclab.environments.reward_terms import split_reward
+from saclab.environments.vector import TrainingEnvironments
+from saclab.errors import NonFiniteError, SettingError
+
+
+def test_the_remainder_is_what_the_terms_leave():
+    info = {"forward": 2.0, "control": np.float64(-0.5), "position": np.zeros(3)}
+    assert split_reward("Some-v0", 4.0, info, ("forward", "control")) == (2.0, -0.5, 2.5)
+    assert split_reward("Some-v0", 4.0, info, ()) == (4.0,)
+
+
+def test_a_term_that_is_not_told_is_named_with_those_that_are():
+    with pytest.raises(SettingError, match=r"reward_terms = .*walking.*it tells forward$"):
+        split_reward("Some-v0", 1.0, {"forward": 2.0, "position": np.zeros(3)}, ("walking",))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_term_that_is_not_finite_is_named(value):
+    with pytest.raises(NonFiniteError, match="reward term forward"):
+        split_reward("Some-v0", 1.0, {"forward": value}, ("forward",))
+
+
+@pytest.mark.parametrize(
+    ("environment", "names"),
+    [
+        ("HalfCheetah-v4", ("reward_run", "reward_ctrl")),
+        ("Humanoid-v4", ("reward_linvel", "reward_quadctrl", "reward_alive")),
+        ("Humanoid-v5", ("reward_forward", "reward_ctrl", "reward_survive", "reward_contact")),
+        ("Pendulum-v1", ()),
+    ],
+)
+def test_the_terms_of_real_environments_add_up_to_their_reward(environment, names):
+    ours = TrainingEnvironments(environment, {}, [3, 4], names)
+    plain = TrainingEnvironments(environment, {}, [3, 4])
+    generator = np.random.default_rng(0)
+    for _ in range(20):
+        action = generator.uniform(-1, 1, (2, ours.spec.action_size)).astype(np.float32)
+        terms, whole = ours.step(action)[0].reward_terms, plain.step(action)[0].reward_terms
+        assert terms.shape == (2, len(names) + 1)
+        np.testing.assert_allclose(terms.sum(axis=1), whole[:, 0], rtol=1e-5, atol=1e-5)
+        if names:
+            np.testing.assert_allclose(terms[:, -1], 0, atol=1e-5)  # these environments tell all of it
+    for environments in (ours, plain):
+        environments.close()

@@ -1,4 +1,4 @@
-"""The random part of a run's actions: uniform ones at first, then noise for the policy, fresh or held for some steps."""
+"""Draws of a run's exploration: uniform actions at first, then noise for the policy, fresh or held for some steps."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Exploration:
 
     def capture(self) -> tuple[dict[str, Any], Arrays]:
         """The generator's state, and the noise that is held, if any can be."""
-        arrays = {"held": self.held, "steps_left": self.steps_left} if len(self.length_shares) > 1 else {}
+        arrays: Arrays = {"held": self.held, "steps_left": self.steps_left} if len(self.length_shares) > 1 else {}
         return dict(self.generator.bit_generator.state), arrays
 
     def restore(self, state: object, arrays: Arrays) -> None:

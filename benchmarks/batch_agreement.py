@@ -1,7 +1,7 @@
 """Do runs of a batch learn as runs alone do? Compare the test returns of two folders of runs, seed by seed drawn.
 
     saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --acting-delay 1 --runs alone
-    saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --batch 8 --runs batch
+    saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --acting-delay 1 --batch 8 --runs batch
     python benchmarks/batch_agreement.py alone batch --figure docs/images/batch-curves.png
 
 Prints, for the mean over all tests and for the last test, the means over seeds with their standard errors, the

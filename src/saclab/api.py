@@ -140,7 +140,7 @@ def compare(
             Ray as many tasks as the cluster has room for.
         threads: cores that XLA uses for each run, or for a batch; None for one, or for all.
         batch: how many runs of the same structure are trained as one batch; 0 for each alone, None for 16 where there
-            is an accelerator. Then acting_delay is 1, unless it is given.
+            is an accelerator.
         runs: the folder that holds all runs; on Ray, one that all machines share.
         report: the report's folder; None for `runs`/report.
         environment_arguments: keyword arguments of every environment.
@@ -158,8 +158,6 @@ def compare(
     """
     require(workers is None or workers >= 1, "workers", workers, "use at least 1")
     batch = chosen_batch(batch, launcher, ray_gpus)
-    if batch:
-        overrides = {"acting_delay": 1} | overrides
     cores = len(usable_cores())
     threads = threads or (cores if batch and launcher == "local" else max(1, int(ray_cpus or 1)))
     cluster = ray.chosen_cluster(launcher, threads, ray_address, ray_cpus, ray_gpus)
@@ -206,12 +204,11 @@ def batch_note(cells: Sequence[Cell], batch: int) -> str:
     unfinished = [cell for cell in cells if not cell.finished]
     groups = batches(unfinished, batch)
     sizes = ", ".join(str(len(group.members)) for group in groups) or "none to do"
-    training = cells[0].config.training
-    behind = "waits for the updates" if training.acting_delay == 0 else "is one round of updates behind"
-    return (
-        f"batches of {sizes} run(s), each with the machine to itself; the policy that acts {behind} (acting_delay "
-        f"{training.acting_delay}); {ratio_note(cells[0].config)}"
-    )
+    if cells[0].config.training.acting_delay:
+        acting = "the policy that acts is one round of updates behind (acting_delay 1)"
+    else:
+        acting = "the environments wait for the updates (--acting-delay 1 is faster: it steps them meanwhile)"
+    return f"batches of {sizes} run(s), each with the machine to itself; {acting}; {ratio_note(cells[0].config)}"
 
 
 def reproduce(
@@ -252,8 +249,6 @@ def reproduce(
     if updates is not None:
         overrides["max_updates"] = updates
     batch = chosen_batch(batch)
-    if batch:
-        overrides["acting_delay"] = 1
     cells = plan(environments, variants, seeds, "paper", runs, {}, overrides)
     cores = len(usable_cores())
     workers = workers or cores

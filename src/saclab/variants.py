@@ -1,7 +1,8 @@
 """The variants of SAC, each a row of data: what differs from plain SAC.
 
 A variant is a point in the space of `AlgorithmSettings`; any other setting can be changed beside it. A row may hold
-settings of the training too (`TrainingSettings`), such as an update-to-data ratio: they count for more than the protocol's.
+settings of the training too (`TrainingSettings`), such as an update-to-data ratio: they count for more than the
+protocol's.
 """
 
 from __future__ import annotations

@@ -147,10 +147,10 @@ def test_compare_trains_batches_and_each_run_has_its_own_place(tmp_path):
     assert not result.failed
     assert result.report is not None
     assert len(result.runs) == 4
-    assert {run.config.training.acting_delay for run in result.runs} == {1}
+    assert {run.config.training.acting_delay for run in result.runs} == {0}, "how it is computed is no setting"
     assert {read_run(run.path).machine["batch"] for run in result.runs} == {4}
     assert "batches of 4 run(s)" in told[0]
-    assert "acting_delay 1" in told[0]
+    assert "--acting-delay 1 is faster" in told[0]
     assert "update-to-data ratio 1" in told[0]
     for run in result.runs:
         assert (run.path / "best/policy.safetensors").exists()
@@ -158,11 +158,20 @@ def test_compare_trains_batches_and_each_run_has_its_own_place(tmp_path):
         assert read_last_session(run.path)["machine"]["batch"] == 4
 
 
-@pytest.mark.slow
-def test_acting_delay_0_is_kept_if_it_is_asked_for(tmp_path):
-    result = saclab.compare(["Pendulum-v1"], ["sac"], 1, "quick", batch=1, runs=tmp_path,
-                            **{**SETTINGS, "acting_delay": 0})  # fmt: skip
-    assert result.runs[0].config.training.acting_delay == 0
+def test_a_grid_begun_alone_goes_on_in_a_batch(tmp_path):
+    """The runs of a laptop are those of a GPU: how a run is computed writes none of its settings."""
+    settings = {name: value for name, value in SETTINGS.items() if name != "acting_delay"} | {"max_updates": 50}
+    alone = saclab.compare(["Pendulum-v1"], ["sac"], 1, "quick", batch=0, runs=tmp_path, **settings)
+    both = saclab.compare(["Pendulum-v1"], ["sac", "sac-auto"], 1, "quick", batch=2, runs=tmp_path, **settings)
+    assert not both.failed
+    assert both.report is not None, "its runs are comparable"
+    assert [run.machine["batch"] for run in both.runs] == [0, 1]
+    assert alone.runs[0].config.training == both.runs[1].config.training
+
+
+def test_the_delay_of_a_batch_is_the_users_choice(tmp_path):
+    (cell,) = grid(tmp_path, seeds=1, acting_delay=1)[:1]
+    assert "one round of updates behind (acting_delay 1)" in api.batch_note([cell], 4)
 
 
 @pytest.mark.parametrize("present", [True, False])

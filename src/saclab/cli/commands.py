@@ -124,7 +124,7 @@ class Compare:
     bits."""
     batch: int | None = None
     """Runs of the same structure that are trained as one batch, their replay buffers on the device; 0 for each alone.
-    None for 16 on an accelerator, else 0. In a batch acting_delay is 1, unless it is given."""
+    None for 16 on an accelerator, else 0. Changes no setting of a run; --acting-delay 1 makes a batch faster."""
     launcher: Literal["local", "ray"] = "local"
     """Processes on this machine, or a Ray cluster whose machines share the runs' folder; needs the extra `ray`."""
     ray_address: str | None = None

@@ -201,7 +201,7 @@ class Breaking(gymnasium.Env):
 gymnasium.register("Breaking-v0", Breaking)
 """
     )
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
     result = subprocess.run(
         [sys.executable, "-m", "saclab", "compare", "breaking:Breaking-v0", "Pendulum-v1", "--variants", "sac",
          "--protocol", "quick", "--seeds", "1", *SHORT],

@@ -59,7 +59,7 @@ def test_a_stopped_grid_goes_on_where_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not hold processes to cores")
 def test_workers_that_fill_the_machine_keep_to_their_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     told = "import atexit, os; f = open(f'{os.path.dirname(__file__)}/cores-{os.getpid()}', 'w')\n"
     (tmp_path / "sitecustomize.py").write_text(
         told + "atexit.register(lambda: print(*sorted(os.sched_getaffinity(0)), file=f))\n"
@@ -80,7 +80,7 @@ def test_fewer_or_more_workers_than_cores_are_left_to_the_system() -> None:
 
 
 def test_a_worker_that_dies_is_a_failed_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     (tmp_path / "sitecustomize.py").write_text("raise SystemExit('no python today')")
     *_, statuses = launch(grid(tmp_path), workers=2, threads=1, requests=Requests())
     assert [status.status for status in statuses] == ["failed", "failed"]

@@ -21,7 +21,7 @@ CHILD = "import os, sys, time; sys.path[:0] = {path!r}; from saclab.grid.worker_
 def worker(folder: Path, program: str, monkeypatch: pytest.MonkeyPatch) -> WorkerProcess:
     """A worker process that runs this in place of training."""
     (folder / "sitecustomize.py").write_text(f"import os, sys, time\n{program}\nsys.stdout.flush()\nos._exit(0)\n")
-    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
     return WorkerProcess({"runs": [{"folder": str(folder / "run")}]}, {"THREADS": "3"}, str(folder))
 
 

@@ -75,11 +75,16 @@ PROTOCOLS: dict[str, Protocol] = {
 }
 
 
-def protocol_settings(protocol: str, environment: str) -> dict[str, Any]:
-    """What a protocol changes on an environment, of either kind of settings; raises UserError for an unknown one."""
+def protocol_row(protocol: str) -> Protocol:
+    """The protocol of a name; raises UserError for an unknown one."""
     if protocol not in PROTOCOLS:
         raise unknown_name("protocol", protocol, PROTOCOLS)
-    row = PROTOCOLS[protocol]
+    return PROTOCOLS[protocol]
+
+
+def protocol_settings(protocol: str, environment: str) -> dict[str, Any]:
+    """What a protocol sets on an environment, of either kind of settings; raises UserError for an unknown one."""
+    row = protocol_row(protocol)
     changes = dataclasses.asdict(row.settings) | row.algorithm
     for prefix, here in row.by_environment.items():
         if task_name(environment).startswith(prefix):

@@ -9,10 +9,11 @@ import pytest
 from resume.helpers import assert_same_run
 
 import saclab
-from saclab import api
 from saclab.errors import SettingError
+from saclab.grid import resources
 from saclab.grid.groups import batches, structure
 from saclab.grid.launch import launch
+from saclab.grid.local import local_pool
 from saclab.grid.plan import Cell, make_grid
 from saclab.training.requests import Requests
 from saclab.training.run_folder import read_last_session, read_run
@@ -73,14 +74,14 @@ def test_plain_numbers_do_not_separate_batches(tmp_path, change, same):
 @pytest.mark.slow
 def test_a_grid_of_batches_is_stopped_and_goes_on_bit_for_bit(tmp_path):
     whole, stopped = grid(tmp_path / "whole", seeds=1), grid(tmp_path / "stopped", seeds=1)
-    *_, statuses = launch(whole, workers=2, threads=1, requests=Requests(), batch=4)
+    *_, statuses = launch(whole, local_pool(2, threads=1, batch=4), Requests(), batch=4)
     assert {status.status for status in statuses} == {"finished"}
     requests = Requests()
-    for statuses in launch(stopped, workers=2, threads=1, requests=requests, batch=4):
+    for statuses in launch(stopped, local_pool(2, threads=1, batch=4), requests, batch=4):
         if statuses[2].updates > 20:
             requests.stop = 1
     assert [status.status for status in statuses] == ["finished", "finished", "interrupted", "interrupted"]
-    *_, statuses = launch(stopped, workers=1, threads=1, requests=Requests(), batch=4)
+    *_, statuses = launch(stopped, local_pool(1, threads=1, batch=4), Requests(), batch=4)
     assert {status.status for status in statuses} == {"finished"}
     for ours, theirs in zip(whole, stopped, strict=True):
         assert_same_run(ours.folder, theirs.folder)
@@ -90,7 +91,7 @@ def test_a_batch_that_goes_on_without_some_of_its_runs_keeps_its_slots(tmp_path)
     """Two of four runs have finished when the others are continued: what is computed is the same."""
     cells = grid(tmp_path, seeds=2)[::2]  # sac and averaged, two seeds each
     stop = Requests()
-    for statuses in launch(cells, workers=1, threads=1, requests=stop, batch=2):
+    for statuses in launch(cells, local_pool(1, threads=1, batch=2), stop, batch=2):
         if statuses[0].updates > 20:
             stop.stop = 1
     saved = [cell for cell in cells if (cell.folder / "checkpoints").exists()]
@@ -149,7 +150,7 @@ def test_compare_trains_batches_and_each_run_has_its_own_place(tmp_path):
     assert len(result.runs) == 4
     assert {run.config.training.acting_delay for run in result.runs} == {0}, "how it is computed is no setting"
     assert {read_run(run.path).machine["batch"] for run in result.runs} == {4}
-    assert "batches of 4 run(s)" in told[0]
+    assert "run groups of 4 run(s)" in told[0]
     assert "--acting-delay 1 is faster" in told[0]
     assert "update-to-data ratio 1" in told[0]
     for run in result.runs:
@@ -171,16 +172,16 @@ def test_a_grid_begun_alone_goes_on_in_a_batch(tmp_path):
 
 def test_the_delay_of_a_batch_is_the_users_choice(tmp_path):
     (cell,) = grid(tmp_path, seeds=1, acting_delay=1)[:1]
-    assert "one round of updates behind (acting_delay 1)" in api.batch_note([cell], 4)
+    assert "one round of updates behind (acting_delay 1)" in resources.batch_note([cell], 4)
 
 
 @pytest.mark.parametrize("present", [True, False])
 def test_batches_are_made_where_there_is_an_accelerator(monkeypatch, present):
-    monkeypatch.setattr(api, "accelerator", lambda: present)
-    assert api.chosen_batch(None) == (16 if present else 0)
-    assert api.chosen_batch(None, "ray", ray_gpus=0.5) == 16
-    assert api.chosen_batch(None, "ray", ray_gpus=0.0) == 0
-    assert (api.chosen_batch(0), api.chosen_batch(3)) == (0, 3)
+    monkeypatch.setattr(resources, "accelerator", lambda: present)
+    assert resources.chosen_batch(None) == (16 if present else 0)
+    assert resources.chosen_batch(None, "ray", ray_gpus=0.5) == 16
+    assert resources.chosen_batch(None, "ray", ray_gpus=0.0) == 0
+    assert (resources.chosen_batch(0), resources.chosen_batch(3)) == (0, 3)
 
 
 def test_a_negative_batch_is_refused(tmp_path):

@@ -15,8 +15,11 @@ import pytest
 from saclab import api
 from saclab.errors import SettingError, UserError
 from saclab.grid import ray as ray_launch
+from saclab.grid.cluster import Cluster, chosen_cluster
+from saclab.grid.launch import LOSSES
+from saclab.grid.launch import launch as launch_grid
 from saclab.grid.plan import Cell, make_grid
-from saclab.grid.ray import LOSSES, Cluster, chosen_cluster, worker_variables
+from saclab.grid.ray import ray_pool, worker_variables
 from saclab.grid.tasks import RunStatus
 from saclab.training.requests import Requests
 
@@ -98,7 +101,7 @@ def launch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Ite
             yield ray
 
         monkeypatch.setattr(ray_launch, "connected", connected)
-        return ray_launch.launch(grid(tmp_path), workers, threads=1, requests=requests or Requests())
+        return launch_grid(grid(tmp_path), ray_pool(Cluster(), 1, workers=workers), requests or Requests())
 
     return on
 

@@ -17,7 +17,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from saclab.config import Config
 from saclab.errors import NonFiniteError, SettingError, TrainingFailed
-from saclab.protocols import PROTOCOLS, make_config
+from saclab.protocols import make_config
 from saclab.variants import COMPARED
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ class Train:
     seed: int = 0
     """Every random draw of the run derives from it."""
     name: str | None = None
-    """Takes the variant's place in the run folder's path, for runs with other settings."""
+    """Takes the variant's place in the run folder's path, for runs with other settings; the report shows them as an arm
+    of this name."""
     threads: int | None = None
     """Cores that XLA uses; None for all. Results depend on it in the last bits."""
     tensorboard: bool = False
@@ -120,23 +121,26 @@ class Compare:
     """How many seeds, counted from first_seed; None for the protocol's own number."""
     first_seed: int = 0
     """The other seeds follow it."""
+    name: str | None = None
+    """Takes the variant's place in the run folders' paths, for one variant with other settings; the report shows them
+    as an arm of this name."""
     workers: int | None = None
-    """Runs at a time; of a batch, the processes that step its environments. None for one per core, or on Ray as many
-    tasks as the cluster has room for."""
+    """Runs at a time; of a run group, the processes that step its environments. None for one per core, or on Ray as
+    many tasks as the cluster has room for."""
     threads: int | None = None
-    """Cores that XLA uses for each run, or for a batch; None for one, or for all. Results depend on it in the last
+    """Cores that XLA uses for each run, or for a run group; None for one, or for all. Results depend on it in the last
     bits."""
     batch: int | None = None
-    """Runs of the same structure that are trained as one batch, their replay buffers on the device; 0 for each alone.
-    None for 16 on an accelerator, else 0. Changes no setting of a run; --acting-delay 1 makes a batch faster."""
+    """Runs of the same structure that are trained together, as one run group, their replay buffers on the device; 0 for
+    each alone, None for 16 on an accelerator, else 0. It changes no setting; --acting-delay 1 makes it faster."""
     launcher: Literal["local", "ray"] = "local"
     """Processes on this machine, or a Ray cluster whose machines share the runs' folder; needs the extra `ray`."""
     ray_address: str | None = None
-    """Of the cluster; None for RAY_ADDRESS, else the one that runs on this machine, else one that is started."""
+    """Where the cluster answers; None for RAY_ADDRESS, else the one on this machine, else one that is started."""
     ray_cpus: float | None = None
-    """Cores that Ray sets aside for each run, or for a batch; None for threads."""
+    """Cores that Ray sets aside for each run, or for a run group; None for threads."""
     ray_gpus: float = 0.0
-    """GPUs, or the part of one, that Ray sets aside for each run, or for a batch; 0 trains on cores."""
+    """GPUs, or the part of one, that Ray sets aside for each run, or for a run group; 0 trains on cores."""
     report: Path | None = None
     """Folder of the report; None for report in the runs' folder."""
     where: OmitArgPrefixes[Where] = field(default_factory=Where)
@@ -144,15 +148,14 @@ class Compare:
     def __call__(self, console: Console) -> int:
         from saclab import api
         from saclab.cli import display
+        from saclab.grid.plan import seed_numbers
 
         if not self.environments:
             raise SettingError("environments", (), "name at least one, such as: saclab compare HalfCheetah-v4")
-        count = self.seeds if self.seeds is not None else PROTOCOLS[self.protocol].seeds
-        if count < 1:
-            raise SettingError("seeds", count, "use at least 1")
         result = api.compare(
-            self.environments, self.variants, range(self.first_seed, self.first_seed + count), self.protocol,
-            workers=self.workers, threads=self.threads, batch=self.batch, runs=self.where.runs, report=self.report,
+            self.environments, self.variants, seed_numbers(self.seeds, self.protocol, self.first_seed), self.protocol,
+            workers=self.workers, threads=self.threads, batch=self.batch, runs=self.where.runs, name=self.name,
+            report=self.report,
             tell=lambda text: console.print(text, soft_wrap=True, highlight=False),
             environment_arguments=parse_arguments(self.where.environment_arguments),
             show=lambda stream: display.show_grid(stream, console),
@@ -175,9 +178,9 @@ class Reproduce:
     updates: int | None = None
     """Fewer updates than the paper's; the report says that it is scaled down."""
     workers: int | None = None
-    """Runs at a time, one core each; of a batch, the processes that step its environments. None for one per core."""
+    """Runs at a time, one core each; of a run group, the processes that step its environments. None: one per core."""
     batch: int | None = None
-    """Runs of the same structure that are trained as one batch; 0 for each alone, None for 16 on an accelerator."""
+    """Runs of the same structure that are trained as one run group; 0 for each alone, None for 16 on an accelerator."""
     report: Path | None = None
     """Folder of the report; None for report in the runs' folder."""
     runs: Path = Path("runs")

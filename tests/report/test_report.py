@@ -237,7 +237,7 @@ def test_a_run_without_any_log_works(tmp_path):
     run = write_run(tmp_path, finished=False)
     for name in ("metrics.jsonl", "episodes.csv", "evaluations.csv"):
         (run / name).unlink()
-    assert "No run has a test so far" in Page(write_report([run], tmp_path / "out").read_text()).words
+    assert "No run has an evaluation so far" in Page(write_report([run], tmp_path / "out").read_text()).words
 
 
 def test_refusal_writes_nothing(tmp_path):

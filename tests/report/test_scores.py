@@ -1,4 +1,4 @@
-"""From test returns to scores, by hand."""
+"""From evaluation returns to scores, by hand."""
 
 import math
 
@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from saclab.report.runs import read_comparison
-from saclab.report.scores import (
-    MORE_SEEDS,
-    ONE_SEED,
-    aggregate,
-    common_horizon,
-    environment_sentences,
-    number_text,
-    score_environment,
-)
+from saclab.report.scores import aggregate, common_horizon, score_environment
+from saclab.report.sentences import MORE_SEEDS, ONE_SEED, environment_sentences
+from saclab.report.text import number_text
 
 from .synthetic import write_run
 
@@ -27,12 +21,12 @@ def test_scores_of_one_run_by_hand(tmp_path):
     returns = [100.0 * index for index in range(1, 21)]
     entry = scores_of([write_run(tmp_path, returns=returns)])
     (run,) = entry.arms[0].runs
-    assert run.final == 1950.0  # the last two of twenty tests
+    assert run.final == 1950.0  # the last two of twenty evaluations
     assert run.best == 2000.0
     assert run.area == pytest.approx(1050.0)
-    assert run.tests == 20
+    assert run.evaluations == 20
     assert entry.threshold == 1950.0
-    assert run.steps_to_threshold == 200_000  # the test at 2000
+    assert run.steps_to_threshold == 200_000  # the evaluation at 2000
     assert not entry.arms[0].final.exists
     assert entry.arms[0].paper_best == 10182.9
 
@@ -74,10 +68,10 @@ def test_different_budgets_are_cut_to_the_shortest(tmp_path):
     assert common_horizon(read_comparison(folders, allow_mixed=True).runs) == 20_000
 
 
-def test_without_tests_there_is_nothing_to_compare(tmp_path):
+def test_without_evaluations_there_is_nothing_to_compare(tmp_path):
     entry = scores_of([write_run(tmp_path, "sac", seed, evaluations=0, finished=False) for seed in (0, 1)])
     assert entry.arms[0].runs == ()
-    assert environment_sentences(entry) == ["No run has a test so far, so there is nothing to compare."]
+    assert environment_sentences(entry) == ["No run has an evaluation so far, so there is nothing to compare."]
 
 
 def test_returns_that_are_not_numbers_do_not_count(tmp_path):
@@ -100,7 +94,7 @@ def test_one_seed_each_allows_no_conclusion_and_says_how_to_get_one(tmp_path, va
     assert "no conclusion" in first
     assert "--seeds 5" in first
     levels = "; ".join(f"{variant} {number_text(1000 + len(variant))}" for variant in variants)
-    assert second == f"Final test return (one seed, no interval): {levels}."
+    assert second == f"Final evaluation return (one seed, no interval): {levels}."
 
 
 def test_variants_of_one_seed_among_others_take_one_sentence(tmp_path):

@@ -143,7 +143,7 @@ def show_comparison(result: Comparison, console: Console) -> int:
     if result.report:
         cells = [(run.config.environment, run.config.variant) for run in result.runs]
         if len({variant for _, variant in cells}) > 1 and len(set(cells)) == len(cells):
-            from saclab.report.scores import ONE_SEED  # the table above looks like a ranking, and is none
+            from saclab.report.sentences import ONE_SEED  # the table above looks like a ranking, and is none
 
             console.print(ONE_SEED, highlight=False, soft_wrap=True)
         console.print(f"report: {result.report.resolve()}", markup=False, soft_wrap=True)

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saclab.report.runs import Arm, Comparison
+from saclab.report.arms import Arm
+from saclab.report.runs import Comparison
 from saclab.report.statistics import bootstrap_band
 from saclab.training.run_folder import RunRecord
 
@@ -35,11 +36,11 @@ class Quantity(NamedTuple):
 PAPER_PANELS = (
     Quantity("policy_loss", "policy loss", "metrics", "actor_loss", "updates",
              "α log π − Q of the policy's own actions (Eq. 5); about the negative of the critic's value"),
-    Quantity("training_reward", "training reward", "episodes", "return", "episodes",
+    Quantity("training_return", "training return", "episodes", "return", "episodes",
              "return of each training episode, with the policy's noise"),
-    Quantity("running_average", "training reward, running average", "episodes", "running_average", "episodes",
+    Quantity("running_average", "training return, running average", "episodes", "running_average", "episodes",
              "0.8 old + 0.2 new"),
-    Quantity("test_reward", "test reward", "evaluations", "mean_return", "episodes",
+    Quantity("evaluation_return", "evaluation return", "evaluations", "mean_return", "episodes",
              "mean return of the deterministic policy"),
 )  # fmt: skip
 """The panels of the paper's Figures 1 and 2."""

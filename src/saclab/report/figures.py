@@ -17,11 +17,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from saclab.report.arms import Arm, by_paper_name
 from saclab.report.curves import AXES, DIAGNOSTICS, PAPER_PANELS, ArmCurves, Curves, Quantity, logged
+from saclab.report.notices import all_notices, notices
+from saclab.report.pairs import Pair
 from saclab.report.paper import paper_curves
-from saclab.report.runs import Arm, Comparison, all_notices, by_paper_name, notices, shown
-from saclab.report.scores import AggregateScores, EnvironmentScores, Pair, number_text
+from saclab.report.runs import Comparison
+from saclab.report.scores import AggregateScores, EnvironmentScores
 from saclab.report.statistics import Band, Interval
+from saclab.report.text import number_text, shown
 from saclab.training.run_folder import safe_name
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -63,7 +67,7 @@ def write_figures(
                 "improvement": draw_pairs(entry.pairs, shown(entry.environment)),
                 "profiles": draw_profiles(
                     {arm.arm: arm.profile for arm in entry.arms if arm.profile},
-                    entry.thresholds, "final test return", shown(entry.environment), styles,
+                    entry.thresholds, "final evaluation return", shown(entry.environment), styles,
                 ),
             }  # fmt: skip
             for kind, figure in figures.items():
@@ -125,7 +129,7 @@ def draw_curves(
         for arm, index in styles.items():
             if of_arm := curves.get((environment, arm, quantity.key)):
                 handles |= draw_arm(panel, of_arm, arm, quantity.axis, index)
-        if quantity.key == "test_reward":
+        if quantity.key == "evaluation_return":
             handles |= draw_paper(panel, environment, by_paper_name(styles))
         panel.set_title(quantity.title, loc="left", fontsize=10)
         panel.set_xlabel(AXES[quantity.axis])
@@ -153,12 +157,12 @@ def draw_arm(panel: Any, curves: ArmCurves, arm: Arm, axis: str, index: int) -> 
 
 
 def draw_paper(panel: Any, environment: str, styles: dict[str, int]) -> dict[str, Any]:
-    """The paper's own test-reward curves, dashed, in the colour of the variant of that name."""
+    """The paper's own curves of evaluation returns, dashed, in the colour of the variant of that name."""
     handles = {}
     limit = panel.get_xlim()[1] if panel.lines else np.inf
     for name, curve in paper_curves(environment).items():
         colour = COLOURS[styles[name] % len(COLOURS)] if name in styles else "#777777"
-        x, y = curve.episode[curve.episode <= limit], curve.test_reward[curve.episode <= limit]
+        x, y = curve.episode[curve.episode <= limit], curve.evaluation_return[curve.episode <= limit]
         (line,) = panel.plot(x, y, color=colour, linewidth=1.1, linestyle="--")
         handles[f"paper: {name}, 1 seed, ±300"] = line
     return handles
@@ -185,13 +189,17 @@ def draw_interval(panel: Any, row: int, interval: Interval, index: int) -> None:
 
 
 def draw_scores(entry: EnvironmentScores, styles: dict[Arm, int]) -> Figure | None:
-    """Final, best and average test return of every arm: interquartile mean with its 95 % interval, and every run."""
+    """Final, best and mean evaluation return of every arm: interquartile mean with its 95 % interval, and every run."""
     arms = [arm for arm in entry.arms if arm.runs]
     if not arms:
         return None
     figure = new_figure(11, 1.6 + 0.55 * len(arms), shown(entry.environment))
     panels = figure.subplots(1, 3, sharey=True)
-    titles = {"final": "final test return", "best": "best test return (flatters)", "area": "mean over training"}
+    titles = {
+        "final": "final evaluation return",
+        "best": "best evaluation return (flatters)",
+        "area": "mean over training",
+    }
     for panel, (field, title) in zip(panels, titles.items()):
         for row, arm in enumerate(arms):
             draw_interval(panel, row, getattr(arm, field), styles[arm.arm])
@@ -282,10 +290,10 @@ def draw_aggregate(aggregate: AggregateScores | None, styles: dict[Arm, int]) ->
     set_arm_rows(
         panel, [f"{wrapped(entry.arm.title)}\n{entry.interquartile_mean.runs} runs" for entry in aggregate.arms]
     )
-    panel.set_xlabel("interquartile mean of normalised final test returns")
+    panel.set_xlabel("interquartile mean of normalised final evaluation returns")
     profiles = {entry.arm: entry.profile for entry in aggregate.arms}
     return {
         "intervals": figure,
         "improvement": draw_pairs(aggregate.pairs, "All environments"),
-        "profiles": draw_profiles(profiles, aggregate.thresholds, "normalised final test return", title, styles),
+        "profiles": draw_profiles(profiles, aggregate.thresholds, "normalised final evaluation return", title, styles),
     }

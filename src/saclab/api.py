@@ -18,7 +18,7 @@ from saclab.training.run_folder import RunRecord, read_config, read_run, run_pat
 from saclab.variants import COMPARED
 
 Q_BIAS_EPISODES = 2
-"""With each evaluation of `reproduce`: the paper's hypothesis is that averaging lowers the bias."""
+"""Episodes for the Q bias in `reproduce`: the paper's hypothesis is that averaging lowers it."""
 
 
 def train(

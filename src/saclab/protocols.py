@@ -26,8 +26,8 @@ class Protocol:
 
 PROTOCOLS: dict[str, Protocol] = {
     "paper": Protocol(
-        "The paper's experiment: an update every 5 steps, replay of 2e5, a test of 20 episodes every 10 episodes; "
-        "1.2e6 updates, on Humanoid at most 1.5e6 updates or 1e4 episodes or 750 episodes without a better test.",
+        "The paper's experiment: an update every 5 steps, replay of 2e5, an evaluation of 20 episodes every 10; "
+        "1.2e6 updates, on Humanoid at most 1.5e6 updates or 1e4 episodes or 750 episodes without a better evaluation.",
         TrainingSettings(
             random_steps=10_000,
             update_interval=5,
@@ -42,7 +42,7 @@ PROTOCOLS: dict[str, Protocol] = {
     ),
     "standard": Protocol(
         "What most SAC papers report: 1M environment steps, an update each step, replay of 1e6, "
-        "a test of 10 episodes every 10k steps.",
+        "an evaluation of 10 episodes every 10k steps.",
         TrainingSettings(
             random_steps=10_000,
             update_interval=1,

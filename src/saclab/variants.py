@@ -17,7 +17,7 @@ from saclab.errors import unknown_name
 @dataclass(frozen=True)
 class Variant:
     title: str
-    """As it stands in figures and tables."""
+    """A name for figures and tables."""
     description: str
     settings: dict[str, Any] = field(default_factory=dict)
     """What differs from plain SAC, and from the protocol: names of AlgorithmSettings and TrainingSettings."""
@@ -57,7 +57,7 @@ VARIANTS: dict[str, Variant] = {
     "averaged-entropy": Variant(
         "Averaged entropy term (not Eq. 9)",
         "What the paper's authors ran under the name Averaged-SAC: no value is averaged, only the entropy term "
-        "α·log π, row by row over the last K unrelated minibatches. Kept to test their published numbers.",
+        "α·log π, row by row over the last K unrelated minibatches. Kept to check their published numbers.",
         {"entropy_window": 10},
     ),
 }

@@ -64,7 +64,7 @@ def test_compare_again_skips_what_is_finished(trained: Path) -> None:
     assert (run_folder(trained) / "evaluations.csv").stat().st_mtime_ns == before
 
 
-def test_settings_given_to_compare_reach_every_run_and_the_others_keep_their_variant(trained: Path) -> None:
+def test_compare_gives_settings_to_every_run_and_keeps_variants(trained: Path) -> None:
     configs = [json.loads((run_folder(trained, v) / "config.json").read_text())["config"] for v in ("sac", "averaged")]
     assert [config["algorithm"]["batch_size"] for config in configs] == [32, 32]
     assert [config["algorithm"]["snapshots"] for config in configs] == [1, 10]
@@ -101,9 +101,7 @@ def test_report_reads_run_folders(trained: Path) -> None:
 
 
 @pytest.mark.parametrize("batch", [0, pytest.param(2, marks=pytest.mark.slow)])
-def test_reproduce_forecasts_the_time_runs_the_papers_protocol_and_says_that_it_is_scaled_down(
-    tmp_path: Path, batch: int
-) -> None:
+def test_reproduce_forecasts_trains_and_says_that_it_is_scaled_down(tmp_path: Path, batch: int) -> None:
     arguments = ("reproduce", "--environments", "Pendulum-v1", "--variants", "sac", "--seeds", "1", "--updates", "20",
                  "--batch", str(batch))  # fmt: skip
     result = saclab(*arguments, folder=tmp_path)

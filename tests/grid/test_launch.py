@@ -29,7 +29,7 @@ def grid(runs: Path, **overrides: object) -> list[Cell]:
     return make_grid(["Pendulum-v1"], ["sac", "sac-auto"], "quick", [0], runs, overrides={**SETTINGS, **overrides})
 
 
-def test_a_grid_has_all_variants_of_a_seed_before_the_next_and_no_cell_twice(tmp_path: Path) -> None:
+def test_a_grid_goes_seed_by_seed_and_has_no_cell_twice(tmp_path: Path) -> None:
     cells = make_grid(["A-v0", "B-v0", "A-v0"], ["sac", "averaged", "sac"], "quick", [3, 4], tmp_path)
     named = [(cell.config.seed, cell.config.environment, cell.config.variant) for cell in cells]
     assert named == [

@@ -108,7 +108,7 @@ def kill_worker(cell: Cell, victim: Callable[[int], int]) -> None:
     wait_for(lambda: is_dead(worker), seconds=1)
 
 
-def test_a_grid_whose_processes_are_killed_ends_with_the_bits_of_local_workers(tmp_path, straight, capfd):
+def test_killed_processes_change_no_bit_of_a_grid(tmp_path, straight, capfd):
     cells = grid(tmp_path)
     victims = {cells[0].folder: ray_process, cells[1].folder: lambda worker: worker}
     statuses: list[RunStatus] = []
@@ -126,7 +126,7 @@ def test_a_grid_whose_processes_are_killed_ends_with_the_bits_of_local_workers(t
     assert_same_grid(cells, straight)
 
 
-def test_a_batch_whose_process_is_killed_ends_with_the_bits_of_a_local_batch(tmp_path):
+def test_a_killed_process_changes_no_bit_of_a_run_group(tmp_path):
     """Its environments' processes end with it."""
     settings = {**SETTINGS, "max_updates": 6000, "acting_delay": 1}
     here, there = (
@@ -145,7 +145,7 @@ def test_a_batch_whose_process_is_killed_ends_with_the_bits_of_a_local_batch(tmp
     assert_same_grid(there, here)
 
 
-def test_a_grid_that_is_stopped_on_ray_is_finished_by_local_workers_to_the_same_bits(tmp_path, straight):
+def test_local_workers_finish_what_was_stopped_on_ray(tmp_path, straight):
     cells, requests = grid(tmp_path), Requests()
     statuses: list[RunStatus] = []
     for statuses in on_ray(cells, requests):  # noqa: B007 - the last ones are looked at

@@ -57,7 +57,7 @@ def test_a_worker_dies_at_once_with_its_launcher():
     wait_for(lambda: not state.exists() or ") Z" in state.read_text(), seconds=2)
 
 
-def test_a_worker_that_outlived_its_launcher_before_it_could_ask_does_not_begin():
+def test_a_worker_whose_launcher_is_gone_does_not_begin():
     child = CHILD.format(path=sys.path, then="die_with(1); print('begun')")
     ended = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (1, "")

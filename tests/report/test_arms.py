@@ -138,6 +138,8 @@ def test_many_arms_are_ranked_and_undecided_pairs_take_one_sentence(seven):
     count = sum(not pair.improvement.decided for pair in entry.pairs)
     assert len(verdicts) == 21 - count > 0
     assert all(" beats " in verdict for verdict in verdicts)
-    assert undecided.startswith(f"{count} of the 21 pairs cannot be told apart with these seeds; nearest to it is ")
+    assert undecided.startswith(
+        f"{count} of the 21 pairs cannot be told apart with these seeds; the nearest to a verdict is "
+    )
     best = max(entry.arms, key=lambda arm: arm.final.estimate).arm.name
     assert levels.startswith(f"Final evaluation return (highest first): {best} ")

@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Test a run's best policy on fresh episodes."""
+    """Evaluate a run's best policy on fresh episodes."""
 
     run: Positional[Path]
     """The run folder, or a folder that holds a policy."""
     episodes: int = 20
-    """Test episodes, stepped side by side."""
+    """How many episodes, stepped side by side."""
     seed: int = 1_000_000
-    """Of the episodes' starts; other than in training, where the policy was chosen."""
+    """Seed of the episodes' starts, another than in training, where the policy was chosen."""
     stochastic: bool = False
     """Sample actions in place of the mean action."""
     json: bool = False
@@ -58,7 +58,7 @@ class Record:
     steps: int = 300
     """Environment steps to film at most."""
     seed: int = 1_000_000
-    """Of the episode's start."""
+    """Seed of the episode's start."""
     size: int = 320
     """Width and height in pixels."""
     imports: tuple[str, ...] = ()

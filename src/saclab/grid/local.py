@@ -53,7 +53,7 @@ class LocalPool:
         self.environment_workers, self.threads, self.checkpoint_minutes = environment_workers, threads, minutes
         self.free_cores = core_groups(places, threads)
         self.workers: dict[int, Worker] = {}
-        """By the file descriptor of what they say."""
+        """File descriptor of what a worker says -> the worker."""
 
     def start(self, task: Task) -> bool:
         cores = self.free_cores.pop(0)

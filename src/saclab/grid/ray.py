@@ -72,7 +72,7 @@ class RayPool:
     note: str | None
     replaces_lost: bool = True
     workers: dict[Any, Worker] = field(default_factory=dict)
-    """By the answer that is awaited of each."""
+    """Answer that is awaited -> the worker that gives it."""
 
     @cached_property
     def actor_type(self) -> Any:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from saclab.config import require
 from saclab.grid.cluster import Cluster, chosen_cluster
-from saclab.grid.groups import batches
+from saclab.grid.groups import run_groups
 from saclab.grid.local import local_pool
 from saclab.grid.plan import Cell, require_startable
 from saclab.grid.pool import WorkerPool
@@ -93,7 +93,7 @@ def batch_note(cells: Sequence[Cell], batch: int) -> str:
     """What a user should know of a grid that is trained in run groups of at most `batch`."""
     from saclab.training.journal import ratio_note
 
-    groups = batches([cell for cell in cells if not cell.finished], batch)
+    groups = run_groups([cell for cell in cells if not cell.finished], batch)
     sizes = ", ".join(str(len(group.members)) for group in groups) or "none to do"
     if cells[0].config.training.acting_delay:
         acting = "the policy that acts is one round of updates behind (acting_delay 1)"

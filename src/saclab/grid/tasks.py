@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from saclab.grid.groups import batches
+from saclab.grid.groups import run_groups
 from saclab.grid.plan import Cell
 from saclab.grid.rate import RateMeter
 from saclab.grid.worker_process import how_it_ended
@@ -119,9 +119,9 @@ def make_statuses(cells: Sequence[Cell]) -> list[RunStatus]:
 
 
 def make_tasks(statuses: Sequence[RunStatus], batch: int) -> list[Task]:
-    """The unfinished runs, each alone, or up to `batch` of the same structure together; in the grid's order."""
+    """The unfinished runs, each alone, or up to `batch` of the same structure as one group; in the grid's order."""
     waiting = [status for status in statuses if status.status == "waiting"]
     if batch == 0:
         return [Task([status], 0) for status in waiting]
-    groups = batches([status.cell for status in waiting], batch)
+    groups = run_groups([status.cell for status in waiting], batch)
     return [Task([waiting[index] for index in group.members], group.slots) for group in groups]

@@ -70,7 +70,7 @@ class Series(NamedTuple):
     """One quantity of one run; the arrays have equal lengths."""
 
     x: dict[str, np.ndarray]
-    """By key of AXES; hours for seconds."""
+    """Key of AXES -> values; hours for seconds."""
     y: np.ndarray
 
 
@@ -91,12 +91,12 @@ class ArmCurves(NamedTuple):
     """One quantity of one arm in one environment."""
 
     runs: dict[int, Series]
-    """By seed; without those that have no value yet."""
+    """Seed -> its curve, without those that have no value yet."""
     band: SeedBand
 
 
 Curves = dict[tuple[str, Arm, str], ArmCurves]
-"""By environment, arm and key of a quantity; missing where nothing was logged."""
+"""(environment, arm, key of a quantity) -> curves; missing where nothing was logged."""
 
 
 def gather_curves(comparison: Comparison) -> Curves:

@@ -30,6 +30,7 @@ from saclab.training.run_folder import safe_name
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DOTS_PER_INCH = 150
+FEW_ARMS = 4  # so many can be told apart seed by seed
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 STYLE: Any = {
     "font.size": 9,
@@ -128,7 +129,7 @@ def draw_curves(
     for panel, quantity in zip(panels, quantities):
         for arm, index in styles.items():
             if of_arm := curves.get((environment, arm, quantity.key)):
-                handles |= draw_arm(panel, of_arm, arm, quantity.axis, index)
+                handles |= draw_arm(panel, of_arm, arm, quantity.axis, index, len(styles) > FEW_ARMS)
         if quantity.key == "evaluation_return":
             handles |= draw_paper(panel, environment, by_paper_name(styles))
         panel.set_title(quantity.title, loc="left", fontsize=10)
@@ -145,13 +146,13 @@ def draw_curves(
     return figure
 
 
-def draw_arm(panel: Any, curves: ArmCurves, arm: Arm, axis: str, index: int) -> dict[str, Any]:
-    """Draw one arm; returns its legend entry, with its number of seeds."""
-    colour, band = COLOURS[index % len(COLOURS)], curves.band
+def draw_arm(panel: Any, curves: ArmCurves, arm: Arm, axis: str, index: int, crowded: bool) -> dict[str, Any]:
+    """Draw one arm, its seeds and band fainter among many; returns its legend entry, with its number of seeds."""
+    colour, band, ink = COLOURS[index % len(COLOURS)], curves.band, 0.4 if crowded else 1.0
     if len(curves.runs) > 1:
         for curve in curves.runs.values():
-            panel.plot(curve.x[axis], curve.y, color=colour, linewidth=0.5, alpha=0.45)
-        panel.fill_between(band.x[axis], band.low, band.high, color=colour, alpha=0.18, linewidth=0)
+            panel.plot(curve.x[axis], curve.y, color=colour, linewidth=0.5, alpha=0.45 * ink)
+        panel.fill_between(band.x[axis], band.low, band.high, color=colour, alpha=0.18 * ink, linewidth=0)
     (line,) = panel.plot(band.x[axis], band.middle, **marker_style(index, len(band.middle)))
     return {wrapped(f"{arm.title}, {seeds_text(band.runs)}", 40): line}
 
@@ -168,8 +169,8 @@ def draw_paper(panel: Any, environment: str, styles: dict[str, int]) -> dict[str
     return handles
 
 
-def wrapped(text: str, width: int = 32) -> str:
-    return "\n".join(textwrap.wrap(text, width, break_on_hyphens=False))
+def wrapped(text: str, width: int = 32, on_hyphens: bool = False) -> str:
+    return "\n".join(textwrap.wrap(text, width, break_on_hyphens=on_hyphens))
 
 
 def seeds_text(count: int) -> str:
@@ -250,7 +251,7 @@ def draw_pairs(pairs: Sequence[Pair], title: str) -> Figure | None:
                 fontweight="bold" if pair.improvement.decided else "normal",
             )
     panel.imshow(matrix, cmap=matplotlib.colormaps["PuOr"], vmin=-0.3, vmax=1.3)
-    names = [wrapped(arm.title, 19) for arm in arms]
+    names = [wrapped(arm.title, 19, on_hyphens=True) for arm in arms]
     panel.set_xticks(range(len(arms)), names)
     panel.set_yticks(range(len(arms)), names)
     panel.grid(False)

@@ -21,7 +21,7 @@ AVERAGED_CAVEAT = (
 )
 UPDATES_PER_EPISODE = 200
 STEPS_PER_EPISODE = 1000
-"""Of an episode that is not cut short, as all of HalfCheetah's."""
+"""Length of an episode that is not cut short, as all of HalfCheetah's."""
 
 TABLE_2: dict[str, dict[str, float]] = {
     "HalfCheetah-v4": {"sac": 10182.9, "sac-alpha-tuning": 11348.2, "averaged-sac": 11141.6},

@@ -27,7 +27,7 @@ class Comparison(NamedTuple):
     environments: tuple[str, ...]
     arms: tuple[Arm, ...]
     groups: dict[tuple[str, Arm], tuple[RunRecord, ...]]
-    """By environment and arm; runs in the order of their seeds. Not every arm need have runs everywhere."""
+    """(environment, arm) -> runs in the order of their seeds. Not every arm need have runs everywhere."""
     mixed: tuple[str, ...]
     """The differences that were accepted, each a sentence; empty if all runs are comparable."""
 

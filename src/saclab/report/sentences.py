@@ -14,7 +14,7 @@ from saclab.report.text import count_text, interval_text, number_text
 MORE_SEEDS = "More seeds can change that: compare again with --seeds 5; finished runs are kept."
 ONE_SEED = f"One seed of each variant allows no conclusion about which is better. {MORE_SEEDS}"
 MANY_ARMS = 5
-"""From so many arms on, they are ranked, and pairs that cannot be told apart are summed up in one sentence."""
+"""Number of arms from which on they are ranked, and pairs that cannot be told apart take one sentence."""
 
 
 def environment_sentences(scores: EnvironmentScores) -> list[str]:
@@ -82,8 +82,8 @@ def undecided_sentence(pairs: Sequence[Pair], of: int) -> str:
     if p < 0.5:
         x, y, p, low, high = y, x, 1 - p, 1 - high, 1 - low
     return (
-        f"{len(pairs)} of the {count_text(of, 'pair')} cannot be told apart with these seeds; nearest to it is {x} "
-        f"above {y} (P = {p:.2f} [{low:.2f}, {high:.2f}])."
+        f"{len(pairs)} of the {count_text(of, 'pair')} cannot be told apart with these seeds; the nearest to a verdict "
+        f"is {x} above {y} (P = {p:.2f} [{low:.2f}, {high:.2f}])."
     )
 
 

@@ -8,8 +8,8 @@ from typing import Any, Literal, NamedTuple
 
 from saclab.config import Config
 from saclab.grid.launch import launch
-from saclab.grid.plan import make_grid
-from saclab.grid.resources import chosen_resources
+from saclab.grid.plan import Cell, make_grid
+from saclab.grid.resources import Resources, chosen_resources
 from saclab.grid.tasks import RunStatus
 from saclab.protocols import make_config
 from saclab.signals import requests_from_signals
@@ -17,6 +17,8 @@ from saclab.training.events import Event
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
 from saclab.variants import COMPARED
 
+Show = Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]]
+"""What consumes the stream of a grid's statuses and returns the last ones."""
 Q_BIAS_EPISODES = 2
 """Episodes for the Q bias in `reproduce`: the paper's hypothesis is that averaging lowers it."""
 
@@ -115,7 +117,7 @@ def compare(
     name: str | None = None,
     report: Path | str | None = None,
     environment_arguments: Mapping[str, Any] | None = None,
-    show: Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]] | None = None,
+    show: Show | None = None,
     tell: Callable[[str], None] = lambda text: None,
     checkpoint_minutes: float = 10,
     launcher: Literal["local", "ray"] = "local",
@@ -136,18 +138,16 @@ def compare(
         workers: runs at a time; of a run group, the processes that step its environments. None for one per core, or on
             Ray as many tasks as the cluster has room for.
         threads: cores that XLA uses for each run, or for a run group; None for one, or for all.
-        batch: how many runs of the same structure are trained together, as one run group; 0 for each alone, None for
-            16 where there is an accelerator.
+        batch: runs of one structure that are trained as one run group; 0: each alone, None: 16 on an accelerator.
         runs: the folder that holds all runs; on Ray, one that all machines share.
-        name: takes the variant's place in the run folders' paths, for one variant with other settings; the report
-            shows them as an arm of this name.
+        name: takes the variant's place in the paths, for one variant with other settings: an arm of the report.
         report: the report's folder; None for `runs`/report.
         environment_arguments: keyword arguments of every environment.
         show: consumes the stream of statuses and returns the last ones, such as `saclab.cli.display.show_grid`.
         tell: takes what the user should know before it starts.
         checkpoint_minutes: wall-clock time between checkpoints.
         launcher: "local" for processes on this machine, "ray" for a Ray cluster, which needs the extra `ray`.
-        ray_address: of the cluster; None for RAY_ADDRESS, else the one that runs on this machine, else a new one.
+        ray_address: where the cluster answers; None for RAY_ADDRESS, else the one on this machine, else a new one.
         ray_cpus: cores that Ray sets aside for each run; None for `threads`.
         ray_gpus: GPUs, or the part of one, that Ray sets aside for each run; 0 trains on cores.
         **overrides: any setting of AlgorithmSettings or TrainingSettings, for every run.
@@ -158,12 +158,23 @@ def compare(
     resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
     cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name)
     resources.require_startable(cells)
+    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
+
+
+def _compare(
+    cells: Sequence[Cell],
+    resources: Resources,
+    report: Path,
+    show: Show | None,
+    tell: Callable[[str], None],
+    checkpoint_minutes: float,
+) -> Comparison:
     if note := resources.note(cells):
         tell(note)
     with requests_from_signals() as requests:
         stream = launch(cells, resources.pool(checkpoint_minutes), requests, resources.batch)
         statuses = (show or last)(stream)
-    return compared(statuses, Path(report) if report else Path(runs) / "report", requests.stop)
+    return compared(statuses, report, requests.stop)
 
 
 def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> Comparison:
@@ -188,7 +199,7 @@ def reproduce(
     batch: int | None = None,
     runs: Path | str = "runs",
     report: Path | str | None = None,
-    show: Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]] | None = None,
+    show: Show | None = None,
     tell: Callable[[str], None] = print,
     checkpoint_minutes: float = 10,
 ) -> Comparison:
@@ -225,10 +236,7 @@ def reproduce(
         hours = forecast_hours(cells, resources.workers, resources.threads, resources.batch)
         about = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.0f} minutes"
         tell(f"forecast: about {about} with {resources.workers} worker(s); stop at any time, the same command goes on")
-    return compare(
-        environments, variants, seeds, "paper", workers=workers, batch=resources.batch, runs=runs, report=report,
-        show=show, tell=tell, checkpoint_minutes=checkpoint_minutes, **overrides,
-    )  # fmt: skip
+    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
 
 
 def last(stream: Iterable[Sequence[RunStatus]]) -> list[RunStatus]:

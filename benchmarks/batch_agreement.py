@@ -1,10 +1,10 @@
-"""Do runs of a batch learn as runs alone do? Compare the test returns of two folders of runs, seed by seed drawn.
+"""Do runs of a group learn as runs alone do? Compare the evaluation returns of two folders of runs, seed by seed drawn.
 
     saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --acting-delay 1 --runs alone
-    saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --batch 8 --runs batch
+    saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --acting-delay 1 --batch 8 --runs batch
     python benchmarks/batch_agreement.py alone batch --figure docs/images/batch-curves.png
 
-Prints, for the mean over all tests and for the last test, the means over seeds with their standard errors, the
+Prints, for the mean over all evaluations and for the last one, the means over seeds with their standard errors, the
 difference with a 95 % interval (Welch) and the probability that a run of the first folder is above one of the second.
 """
 
@@ -26,13 +26,13 @@ COLOURS = ("#1f77b4", "#d62728")
 
 
 def curves(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Steps [tests] and mean test returns [runs, tests]."""
+    """Steps [evaluations] and mean evaluation returns [runs, evaluations]."""
     runs = [read_run(path) for path in find_runs([folder])]
     return runs[0].evaluations["steps"], np.array([run.evaluations["mean_return"] for run in runs])
 
 
 def agreement(first: np.ndarray, second: np.ndarray) -> str:
-    """Of one number per run."""
+    """Compare two samples of one number per run."""
     welch = stats.ttest_ind(first, second, equal_var=False)
     low, high = welch.confidence_interval()
     above = stats.mannwhitneyu(first, second).statistic / (len(first) * len(second))
@@ -51,7 +51,7 @@ def draw(folders: list[Path], path: Path) -> None:
         axes.plot(
             steps, returns.mean(axis=0), color=colour, linewidth=2, label=f"{folder.name}, mean of {len(returns)}"
         )
-    axes.set(xlabel="environment steps", ylabel="mean return of a test")
+    axes.set(xlabel="environment steps", ylabel="mean return of an evaluation")
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=120)
@@ -64,8 +64,8 @@ def main() -> None:
     options = parser.parse_args()
     (_, first), (_, second) = (curves(folder) for folder in options.folders)
     names = " and ".join(folder.name for folder in options.folders)
-    print(f"{names}, mean over all tests: {agreement(first.mean(axis=1), second.mean(axis=1))}")
-    print(f"{names}, last test: {agreement(first[:, -1], second[:, -1])}")
+    print(f"{names}, mean over all evaluations: {agreement(first.mean(axis=1), second.mean(axis=1))}")
+    print(f"{names}, last evaluation: {agreement(first[:, -1], second[:, -1])}")
     if options.figure:
         draw(options.folders, options.figure)
 

@@ -6,7 +6,7 @@ Kept in benchmarks/results/batches-<device>-<environment>.json: updates per seco
 the compiled program alone (plain and averaged, K = 10); environment steps per second of whole batches at one update per
 step, with the share of each part of a step; and with --alone the same job by one run alone on all cores, and by as many
 processes as cores, one run each, in turn with the batches. Compilation and the random steps are outside all rates.
-Tests and logs are left out.
+Evaluations and logs are left out.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def clocked() -> Iterator[Clock]:
         (TrainingEnvironments, "step", "environment around the simulator"),
         (ReplayBuffer, "add", "replay: store"),
         (ReplayBuffer, "sample", "replay: draw"),
-        (Evaluator, "run", "tests around the simulator"),
+        (Evaluator, "run", "evaluations around the simulator"),
         (mujoco, "mj_step", "simulator"),
     ]
     with ExitStack() as stack:
@@ -169,7 +169,7 @@ def main() -> None:
     prepare_process()
     what = f"{options.environment}, {options.variant}"
     loop = loop_breakdown(options.environment, options.variant, options.updates)
-    show(f"{what}: per update, with its 5 environment steps and their share of the tests", loop)
+    show(f"{what}: per update, with its 5 environment steps and their share of the evaluations", loop)
     update = update_breakdown(options.environment, options.variant, options.updates)
     show(f"{what}: one update", update)
     keep(f"breakdown-{options.environment}-{options.variant}", loop_milliseconds=loop, update_milliseconds=update)

@@ -2,7 +2,8 @@
 
     python benchmarks/memory.py
 
-Each row is a training in a process of its own whose replay buffer is filled to the end, with tests and a checkpoint.
+Each row is a training in a process of its own whose replay buffer is filled to the end, with evaluations and a
+checkpoint.
 "Constant" is the peak less 1.3 times the bytes of replay, parameters, moments and snapshots.
 """
 

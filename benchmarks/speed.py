@@ -2,14 +2,15 @@
 
     python benchmarks/speed.py --peers .venv-peers/bin/python [--rounds 5] [--only TEXT]
 
-End to end: environment, replay, acting, updates, logging, tests and the best policy's file; each library by its own
-loop, tests side by side in all of them. Plain SAC with Table 1 of the paper. Every round runs all contestants of a case
-one after the other, so a ratio compares neighbours in time; medians over rounds are reported. Imports, compilation and
-the first updates are outside the rate and shown as the seconds from the start of the process to the first update.
+End to end: environment, replay, acting, updates, logging, evaluations and the best policy's file; each library by its
+own loop, evaluations side by side in all of them. Plain SAC with Table 1 of the paper. Every round runs all contestants
+of a case one after the other, so a ratio compares neighbours in time; medians over rounds are reported. Imports,
+compilation and the first updates are outside the rate and shown as the seconds from the start of the process to the
+first update.
 
 A case is a single run that may use all cores, or as many runs at once as there are cores, one core each: their rates
 are added. What each is compared with in the end is the machine: the time that the update's matrix products and the raw
-simulator need (machine_limit.py, measured in the same round), the steps of saclab's tests counted in.
+simulator need (machine_limit.py, measured in the same round), the steps of saclab's evaluations counted in.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Case:
         return f"{self.environment}, {ratio}, {'grid' if self.grid else 'single run'}"
 
 
-# Two test steps per training step, as under `paper`, where episodes last 1000 steps; windows that hold whole tests.
+# Two evaluation steps per training step, as under `paper` with episodes of 1000 steps; windows of whole evaluations.
 CASES = [
     Case(environment, interval, grid, timed_updates, test_interval, episodes)
     for interval, grid, timed_updates, test_interval, episodes in (

@@ -6,23 +6,21 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from saclab.config import Config, require
-from saclab.grid import ray
+from saclab.config import Config
 from saclab.grid.launch import launch
 from saclab.grid.plan import Cell, make_grid
+from saclab.grid.resources import Resources, chosen_resources
 from saclab.grid.tasks import RunStatus
-from saclab.machine import accelerator, usable_cores
-from saclab.protocols import PROTOCOLS, make_config
+from saclab.protocols import make_config
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
+from saclab.variants import COMPARED
 
-COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
-"""The variants of a comparison, unless others are asked for."""
-BATCH_ON_ACCELERATOR = 16
-"""Runs of a batch, unless another number is asked for."""
+Show = Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]]
+"""What consumes the stream of a grid's statuses and returns the last ones."""
 Q_BIAS_EPISODES = 2
-"""With each test of `reproduce`: the paper's hypothesis is that averaging lowers the bias."""
+"""Episodes for the Q bias in `reproduce`: the paper's hypothesis is that averaging lowers it."""
 
 
 def train(
@@ -116,9 +114,10 @@ def compare(
     threads: int | None = None,
     batch: int | None = None,
     runs: Path | str = "runs",
+    name: str | None = None,
     report: Path | str | None = None,
     environment_arguments: Mapping[str, Any] | None = None,
-    show: Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]] | None = None,
+    show: Show | None = None,
     tell: Callable[[str], None] = lambda text: None,
     checkpoint_minutes: float = 10,
     launcher: Literal["local", "ray"] = "local",
@@ -136,19 +135,19 @@ def compare(
         variants: keys of `saclab.variants.VARIANTS`.
         seeds: how many (0, 1, …) or which; None for the protocol's own number.
         protocol: a key of `saclab.protocols.PROTOCOLS`.
-        workers: runs at a time; of a batch, the processes that step its environments. None for one per core, or on
+        workers: runs at a time; of a run group, the processes that step its environments. None for one per core, or on
             Ray as many tasks as the cluster has room for.
-        threads: cores that XLA uses for each run, or for a batch; None for one, or for all.
-        batch: how many runs of the same structure are trained as one batch; 0 for each alone, None for 16 where there
-            is an accelerator. Then acting_delay is 1, unless it is given.
+        threads: cores that XLA uses for each run, or for a run group; None for one, or for all.
+        batch: runs of one structure that are trained as one run group; 0: each alone, None: 16 on an accelerator.
         runs: the folder that holds all runs; on Ray, one that all machines share.
+        name: takes the variant's place in the paths, for one variant with other settings: an arm of the report.
         report: the report's folder; None for `runs`/report.
         environment_arguments: keyword arguments of every environment.
         show: consumes the stream of statuses and returns the last ones, such as `saclab.cli.display.show_grid`.
         tell: takes what the user should know before it starts.
         checkpoint_minutes: wall-clock time between checkpoints.
         launcher: "local" for processes on this machine, "ray" for a Ray cluster, which needs the extra `ray`.
-        ray_address: of the cluster; None for RAY_ADDRESS, else the one that runs on this machine, else a new one.
+        ray_address: where the cluster answers; None for RAY_ADDRESS, else the one on this machine, else a new one.
         ray_cpus: cores that Ray sets aside for each run; None for `threads`.
         ray_gpus: GPUs, or the part of one, that Ray sets aside for each run; 0 trains on cores.
         **overrides: any setting of AlgorithmSettings or TrainingSettings, for every run.
@@ -156,26 +155,26 @@ def compare(
     Raises:
         UserError: for a name or value that cannot work, or a missing extra; nothing has been started then.
     """
-    require(workers is None or workers >= 1, "workers", workers, "use at least 1")
-    batch = chosen_batch(batch, launcher, ray_gpus)
-    if batch:
-        overrides = {"acting_delay": 1} | overrides
-    cores = len(usable_cores())
-    threads = threads or (cores if batch and launcher == "local" else max(1, int(ray_cpus or 1)))
-    cluster = ray.chosen_cluster(launcher, threads, ray_address, ray_cpus, ray_gpus)
-    cells = plan(environments, variants, seeds, protocol, runs, environment_arguments, overrides)
-    if batch:
-        tell(batch_note(cells, batch))
+    resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
+    cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name)
+    resources.require_startable(cells)
+    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
+
+
+def _compare(
+    cells: Sequence[Cell],
+    resources: Resources,
+    report: Path,
+    show: Show | None,
+    tell: Callable[[str], None],
+    checkpoint_minutes: float,
+) -> Comparison:
+    if note := resources.note(cells):
+        tell(note)
     with requests_from_signals() as requests:
-        if cluster is None:
-            workers = workers or (cores if batch else max(1, cores // threads))
-            require_startable(cells, min(batch or workers, len(cells)), "--batch" if batch else "--workers")
-            stream = launch(cells, workers, threads, requests, checkpoint_minutes, batch)
-        else:
-            require_startable(cells, 0, "--workers")  # the memory of its machines is not this one's
-            stream = ray.launch(cells, workers, threads, requests, checkpoint_minutes, batch, cluster)
+        stream = launch(cells, resources.pool(checkpoint_minutes), requests, resources.batch)
         statuses = (show or last)(stream)
-    return compared(statuses, Path(report) if report else Path(runs) / "report", requests.stop)
+    return compared(statuses, report, requests.stop)
 
 
 def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> Comparison:
@@ -190,30 +189,6 @@ def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> C
     return Comparison([read_run(folder) for folder in begun], failed, page, interrupted)
 
 
-def chosen_batch(batch: int | None, launcher: str = "local", ray_gpus: float = 0.0) -> int:
-    """How many runs make a batch; None leaves it to where they are trained. Raises SettingError for a negative one."""
-    if batch is None:
-        return BATCH_ON_ACCELERATOR if (ray_gpus > 0 if launcher == "ray" else accelerator()) else 0
-    require(batch >= 0, "batch", batch, "use a number of runs, or 0 to train each alone")
-    return batch
-
-
-def batch_note(cells: Sequence[Cell], batch: int) -> str:
-    """What a user should know of a grid that is trained in batches."""
-    from saclab.grid.groups import batches
-    from saclab.training.journal import ratio_note
-
-    unfinished = [cell for cell in cells if not cell.finished]
-    groups = batches(unfinished, batch)
-    sizes = ", ".join(str(len(group.members)) for group in groups) or "none to do"
-    training = cells[0].config.training
-    behind = "waits for the updates" if training.acting_delay == 0 else "is one round of updates behind"
-    return (
-        f"batches of {sizes} run(s), each with the machine to itself; the policy that acts {behind} (acting_delay "
-        f"{training.acting_delay}); {ratio_note(cells[0].config)}"
-    )
-
-
 def reproduce(
     environments: Sequence[str] = ("HalfCheetah-v4", "Humanoid-v4"),
     variants: Sequence[str] = COMPARED,
@@ -224,7 +199,7 @@ def reproduce(
     batch: int | None = None,
     runs: Path | str = "runs",
     report: Path | str | None = None,
-    show: Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]] | None = None,
+    show: Show | None = None,
     tell: Callable[[str], None] = print,
     checkpoint_minutes: float = 10,
 ) -> Comparison:
@@ -251,66 +226,17 @@ def reproduce(
     overrides: dict[str, Any] = {"q_bias_episodes": Q_BIAS_EPISODES}
     if updates is not None:
         overrides["max_updates"] = updates
-    batch = chosen_batch(batch)
-    if batch:
-        overrides["acting_delay"] = 1
-    cells = plan(environments, variants, seeds, "paper", runs, {}, overrides)
-    cores = len(usable_cores())
-    workers = workers or cores
-    require_startable(cells, min(batch or workers, len(cells)), "--batch" if batch else "--workers")
+    resources = chosen_resources(workers, None, batch)
+    assert resources.workers is not None
+    cells = make_grid(environments, variants, "paper", seeds, runs, {}, overrides)
+    resources.require_startable(cells)
     left = sum(not cell.finished for cell in cells)
     if left:
         tell(f"{left} of {len(cells)} runs to do; a few updates of each kind are measured to forecast the time …")
-        hours = forecast_hours(cells, workers, cores if batch else 1, batch)
+        hours = forecast_hours(cells, resources.workers, resources.threads, resources.batch)
         about = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.0f} minutes"
-        tell(f"forecast: about {about} with {workers} worker(s); stop at any time, the same command goes on")
-    return compare(
-        environments, variants, seeds, "paper", workers=workers, batch=batch, runs=runs, report=report, show=show,
-        tell=tell, checkpoint_minutes=checkpoint_minutes, **overrides,
-    )  # fmt: skip
-
-
-def plan(
-    environments: Sequence[str],
-    variants: Sequence[str],
-    seeds: int | Sequence[int] | None,
-    protocol: str,
-    runs: Path | str,
-    environment_arguments: Mapping[str, Any] | None,
-    overrides: Mapping[str, Any],
-) -> list[Cell]:
-    """The grid of a comparison; raises UserError for a name or value that cannot work."""
-    if seeds is None:
-        seeds = PROTOCOLS[protocol].seeds if protocol in PROTOCOLS else 1
-    numbers = range(seeds) if isinstance(seeds, int) else seeds
-    return make_grid(environments, variants, protocol, numbers, Path(runs), environment_arguments, overrides)
-
-
-def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
-    """Raise UserError before anything is started if an environment, a folder or the memory will not do.
-
-    Args:
-        cells: the grid.
-        at_once: runs whose replay buffers are filled together.
-        fewer: the option that would lower their number.
-    """
-    from saclab.environments.make import environment_spec, make_environment
-    from saclab.replay import RowLayout, require_memory
-    from saclab.training.journal import require_same_config
-
-    checked = set()
-    for cell in cells:
-        if (cell.folder / "config.json").exists():
-            require_same_config(cell.folder, cell.config)
-        if cell.config.environment in checked:
-            continue
-        checked.add(cell.config.environment)
-        environment = make_environment(cell.config.environment, cell.config.environment_arguments)
-        spec = environment_spec(cell.config.environment, environment)
-        environment.close()
-        layout = RowLayout(spec.observation_size, spec.action_size)
-        if fewer == "--workers" or not accelerator():  # else the buffers lie on the device, and the batch looks at it
-            require_memory(cell.config.training.replay_capacity, layout, at_once, fewer)
+        tell(f"forecast: about {about} with {resources.workers} worker(s); stop at any time, the same command goes on")
+    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
 
 
 def last(stream: Iterable[Sequence[RunStatus]]) -> list[RunStatus]:

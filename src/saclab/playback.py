@@ -1,4 +1,4 @@
-"""Use a trained policy: test it on fresh episodes, film it."""
+"""Use a trained policy: evaluate it on fresh episodes, film it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from saclab.training.evaluation import Evaluator
 
 
 class TestResult(NamedTuple):
-    """Of `evaluate`."""
+    """What `evaluate` found."""
 
     environment: str
     episodes: int
@@ -38,7 +38,7 @@ class TestResult(NamedTuple):
 def evaluate(
     run: Path, episodes: int, seed: int, deterministic: bool = True, imports: Sequence[str] = ()
 ) -> TestResult:
-    """Test a run's best policy.
+    """Evaluate a run's best policy.
 
     Raises:
         UserError: if the run has no policy, or its environment would import a package not named in `imports`.

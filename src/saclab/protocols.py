@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names, replace_settings
 from saclab.errors import unknown_name
-from saclab.variants import task_name, variant_settings
+from saclab.variants import default_settings, task_name, variant_changes
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,8 @@ class Protocol:
 
 PROTOCOLS: dict[str, Protocol] = {
     "paper": Protocol(
-        "The paper's experiment: an update every 5 steps, replay of 2e5, a test of 20 episodes every 10 episodes; "
-        "1.2e6 updates, on Humanoid at most 1.5e6 updates or 1e4 episodes or 750 episodes without a better test.",
+        "The paper's experiment: an update every 5 steps, replay of 2e5, an evaluation of 20 episodes every 10; "
+        "1.2e6 updates, on Humanoid at most 1.5e6 updates or 1e4 episodes or 750 episodes without a better evaluation.",
         TrainingSettings(
             random_steps=10_000,
             update_interval=5,
@@ -41,7 +42,7 @@ PROTOCOLS: dict[str, Protocol] = {
     ),
     "standard": Protocol(
         "What most SAC papers report: 1M environment steps, an update each step, replay of 1e6, "
-        "a test of 10 episodes every 10k steps.",
+        "an evaluation of 10 episodes every 10k steps.",
         TrainingSettings(
             random_steps=10_000,
             update_interval=1,
@@ -74,15 +75,26 @@ PROTOCOLS: dict[str, Protocol] = {
 }
 
 
-def training_settings(protocol: str, environment: str) -> TrainingSettings:
-    """The settings of a protocol on an environment; raises UserError for an unknown protocol."""
+def protocol_row(protocol: str) -> Protocol:
+    """The protocol of a name; raises UserError for an unknown one."""
     if protocol not in PROTOCOLS:
         raise unknown_name("protocol", protocol, PROTOCOLS)
-    settings = PROTOCOLS[protocol].settings
-    for prefix, changes in PROTOCOLS[protocol].by_environment.items():
+    return PROTOCOLS[protocol]
+
+
+def protocol_settings(protocol: str, environment: str) -> dict[str, Any]:
+    """What a protocol sets on an environment, of either kind of settings; raises UserError for an unknown one."""
+    row = protocol_row(protocol)
+    changes = dataclasses.asdict(row.settings) | row.algorithm
+    for prefix, here in row.by_environment.items():
         if task_name(environment).startswith(prefix):
-            settings = replace_settings(settings, changes)
-    return settings
+            changes |= here
+    return changes
+
+
+def training_settings(protocol: str, environment: str) -> TrainingSettings:
+    """The training settings of a protocol on an environment; raises UserError for an unknown protocol."""
+    return TrainingSettings(**split_settings(protocol_settings(protocol, environment))[1])
 
 
 def make_config(
@@ -95,6 +107,8 @@ def make_config(
 ) -> Config:
     """The configuration of a run: variant and protocol on an environment, with any setting changed by name.
 
+    What is said later counts: the defaults of the environment, the protocol, the variant, the overrides.
+
     Args:
         environment: Gymnasium id.
         variant: a key of VARIANTS.
@@ -106,19 +120,26 @@ def make_config(
     Raises:
         UserError: for a name that does not exist or a value that cannot work.
     """
-    training = training_settings(protocol, environment)
-    algorithm = replace_settings(variant_settings(variant, environment), PROTOCOLS[protocol].algorithm)
-    algorithm_names, training_names = field_names(AlgorithmSettings), field_names(TrainingSettings)
-    overrides = dict(overrides or {})
-    for name in overrides:
-        if name not in algorithm_names + training_names:
-            raise unknown_name("setting", name, algorithm_names + training_names)
+    said = protocol_settings(protocol, environment) | variant_changes(variant) | dict(overrides or {})
+    algorithm, training = split_settings(said)
     return Config(
         environment=environment,
         variant=variant,
         protocol=protocol,
         seed=seed,
-        algorithm=replace_settings(algorithm, {k: v for k, v in overrides.items() if k in algorithm_names}),
-        training=replace_settings(training, {k: v for k, v in overrides.items() if k in training_names}),
+        algorithm=replace_settings(default_settings(environment), algorithm),
+        training=TrainingSettings(**training),
         environment_arguments=dict(environment_arguments or {}),
+    )
+
+
+def split_settings(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The settings of the algorithm and those of the training; raises UserError for a name that is neither."""
+    algorithm_names, training_names = field_names(AlgorithmSettings), field_names(TrainingSettings)
+    for name in settings:
+        if name not in algorithm_names + training_names:
+            raise unknown_name("setting", name, algorithm_names + training_names)
+    return (
+        {name: value for name, value in settings.items() if name in algorithm_names},
+        {name: value for name, value in settings.items() if name in training_names},
     )

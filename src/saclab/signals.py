@@ -11,7 +11,7 @@ from types import FrameType
 from saclab.training.requests import Requests
 
 EXIT_STATUS: dict[int, int] = {signal.SIGINT: 130, signal.SIGTERM: 143}
-"""Of a command that saved and stopped because of a signal."""
+"""Exit statuses of a command that saved and stopped because of a signal."""
 
 
 @contextmanager

@@ -1,6 +1,8 @@
 """The variants of SAC, each a row of data: what differs from plain SAC.
 
-A variant is a point in the space of `AlgorithmSettings`; any other setting can be changed beside it.
+A variant is a point in the space of `AlgorithmSettings`; any other setting can be changed beside it. A row may hold
+settings of the training too (`TrainingSettings`), such as an update-to-data ratio: they count for more than the
+protocol's.
 """
 
 from __future__ import annotations
@@ -8,23 +10,26 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from saclab.config import AlgorithmSettings, replace_settings
+from saclab.config import AlgorithmSettings, field_names, replace_settings
 from saclab.errors import unknown_name
 
 
 @dataclass(frozen=True)
 class Variant:
     title: str
-    """As it stands in figures and tables."""
+    """A name for figures and tables."""
     description: str
     settings: dict[str, Any] = field(default_factory=dict)
-    """What differs from plain SAC."""
+    """What differs from plain SAC, and from the protocol: names of AlgorithmSettings and TrainingSettings."""
     paper_name: str | None = None
     """The name of the system in the paper's figures and Table 2, if it stands there."""
 
 
 LEARNED = {"temperature": "learned", "initial_temperature": 1.0}
 AVERAGED = {"snapshots": 10}
+
+COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
+"""The variants of a comparison, unless others are asked for."""
 
 VARIANTS: dict[str, Variant] = {
     "sac": Variant(
@@ -52,7 +57,7 @@ VARIANTS: dict[str, Variant] = {
     "averaged-entropy": Variant(
         "Averaged entropy term (not Eq. 9)",
         "What the paper's authors ran under the name Averaged-SAC: no value is averaged, only the entropy term "
-        "α·log π, row by row over the last K unrelated minibatches. Kept to test their published numbers.",
+        "α·log π, row by row over the last K unrelated minibatches. Kept to check their published numbers.",
         {"entropy_window": 10},
     ),
 }
@@ -68,9 +73,20 @@ def fixed_temperature(environment: str) -> float:
     return 0.1 if task_name(environment).startswith("Humanoid-") else 0.2
 
 
-def variant_settings(variant: str, environment: str) -> AlgorithmSettings:
-    """The settings of a variant on an environment; raises UserError for an unknown variant."""
+def default_settings(environment: str) -> AlgorithmSettings:
+    """Plain SAC on an environment: what any protocol and variant may change."""
+    return AlgorithmSettings(initial_temperature=fixed_temperature(environment))
+
+
+def variant_changes(variant: str) -> dict[str, Any]:
+    """A variant's row; raises UserError for an unknown one."""
     if variant not in VARIANTS:
         raise unknown_name("variant", variant, VARIANTS)
-    plain = AlgorithmSettings(initial_temperature=fixed_temperature(environment))
-    return replace_settings(plain, VARIANTS[variant].settings)
+    return VARIANTS[variant].settings
+
+
+def variant_settings(variant: str, environment: str) -> AlgorithmSettings:
+    """The algorithm of a variant on an environment, whatever the protocol; raises UserError for an unknown variant."""
+    own = field_names(AlgorithmSettings)
+    changes = {name: value for name, value in variant_changes(variant).items() if name in own}
+    return replace_settings(default_settings(environment), changes)

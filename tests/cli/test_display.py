@@ -10,7 +10,7 @@ from rich.console import Console
 
 from saclab.api import Comparison
 from saclab.cli.display import show_comparison
-from saclab.report.scores import ONE_SEED
+from saclab.report.sentences import ONE_SEED
 from saclab.training.run_folder import read_run
 
 

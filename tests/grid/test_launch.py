@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
-from saclab.grid.launch import core_groups, launch
-from saclab.grid.plan import Cell, make_grid
+from saclab.errors import UserError
+from saclab.grid.launch import launch
+from saclab.grid.local import core_groups, local_pool
+from saclab.grid.plan import Cell, make_grid, seed_numbers
+from saclab.grid.rate import RateMeter
 from saclab.grid.tasks import RunStatus
 from saclab.machine import usable_cores
+from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished
 
@@ -24,7 +29,7 @@ def grid(runs: Path, **overrides: object) -> list[Cell]:
     return make_grid(["Pendulum-v1"], ["sac", "sac-auto"], "quick", [0], runs, overrides={**SETTINGS, **overrides})
 
 
-def test_a_grid_has_all_variants_of_a_seed_before_the_next_and_no_cell_twice(tmp_path: Path) -> None:
+def test_a_grid_goes_seed_by_seed_and_has_no_cell_twice(tmp_path: Path) -> None:
     cells = make_grid(["A-v0", "B-v0", "A-v0"], ["sac", "averaged", "sac"], "quick", [3, 4], tmp_path)
     named = [(cell.config.seed, cell.config.environment, cell.config.variant) for cell in cells]
     assert named == [
@@ -39,19 +44,19 @@ def test_a_status_takes_in_what_a_worker_says(tmp_path: Path) -> None:
     status.enter({"event": "progress", "fraction": 0.25, "updates": 50, "episodes": 1, "steps": 150, "seconds": 1.0})
     status.enter({"event": "evaluated", "mean_return": -3.5, "updates": 50})
     status.enter({"event": "warned", "message": "look"})
-    assert (status.fraction, status.updates, status.test_return, status.warnings) == (0.25, 50, -3.5, ["look"])
+    assert (status.fraction, status.updates, status.evaluation_return, status.warnings) == (0.25, 50, -3.5, ["look"])
     status.enter({"event": "failed", "message": "why"})
     assert (status.status, status.message) == ("failed", "why")
 
 
 def test_a_stopped_grid_goes_on_where_it_was(tmp_path: Path) -> None:
     cells, requests = grid(tmp_path, max_updates=3000), Requests()
-    for statuses in launch(cells, workers=2, threads=1, requests=requests):
+    for statuses in launch(cells, local_pool(2, threads=1), requests):
         if any(status.updates > 100 for status in statuses):
             requests.stop = 1
     assert {status.status for status in statuses} == {"interrupted"}
     assert not any(is_finished(cell.folder) for cell in cells)
-    *_, statuses = launch(cells, workers=2, threads=1, requests=Requests())
+    *_, statuses = launch(cells, local_pool(2, threads=1), Requests())
     assert [status.status for status in statuses] == ["finished", "finished"]
     sessions = [(cell.folder / "sessions.jsonl").read_text().count("\n") for cell in cells]
     assert max(sessions) == 2, "at least the run that had begun was continued, not begun again"
@@ -59,13 +64,13 @@ def test_a_stopped_grid_goes_on_where_it_was(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not hold processes to cores")
 def test_workers_that_fill_the_machine_keep_to_their_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     told = "import atexit, os; f = open(f'{os.path.dirname(__file__)}/cores-{os.getpid()}', 'w')\n"
     (tmp_path / "sitecustomize.py").write_text(
         told + "atexit.register(lambda: print(*sorted(os.sched_getaffinity(0)), file=f))\n"
     )
     cores = usable_cores()
-    for _ in launch(grid(tmp_path), workers=len(cores), threads=1, requests=Requests()):
+    for _ in launch(grid(tmp_path), local_pool(len(cores), threads=1), Requests()):
         pass
     kept = {tuple(map(int, path.read_text().split())) for path in tmp_path.glob("cores-*")} - {()}
     assert kept <= {(core,) for core in cores}
@@ -80,8 +85,54 @@ def test_fewer_or_more_workers_than_cores_are_left_to_the_system() -> None:
 
 
 def test_a_worker_that_dies_is_a_failed_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     (tmp_path / "sitecustomize.py").write_text("raise SystemExit('no python today')")
-    *_, statuses = launch(grid(tmp_path), workers=2, threads=1, requests=Requests())
+    *_, statuses = launch(grid(tmp_path), local_pool(2, threads=1), Requests())
     assert [status.status for status in statuses] == ["failed", "failed"]
-    assert "no python today" in statuses[0].message
+    assert statuses[0].message == "its worker ended (exit status 1: SystemExit: no python today)"
+
+
+def test_a_worker_that_is_killed_is_a_failed_run_on_this_machine(tmp_path: Path) -> None:
+    cells = grid(tmp_path, max_updates=1_000_000)[:1]
+    killed = False
+    for statuses in launch(cells, local_pool(1, threads=1), Requests()):
+        if statuses[0].updates and not killed:
+            os.kill(int((cells[0].folder / "lock").read_text()), signal.SIGKILL)
+            killed = True
+    assert (statuses[0].status, statuses[0].message) == ("failed", "its worker ended (killed by SIGKILL)")
+
+
+def test_a_local_grid_that_is_dropped_saves_and_leaves_no_process_behind(tmp_path: Path) -> None:
+    cells = grid(tmp_path, max_updates=1_000_000)
+    stream = launch(cells, local_pool(2, threads=1), Requests())
+    while not all(status.updates for status in next(stream)):
+        pass
+    workers = [int((cell.folder / "lock").read_text()) for cell in cells]
+    stream.close()
+    assert not [number for number in workers if Path(f"/proc/{number}").exists()]
+    assert all(checkpoint_steps(cell.folder) for cell in cells)
+
+
+def test_the_rate_leaves_out_what_comes_before_the_first_update() -> None:
+    meter = RateMeter()
+    for seconds, fraction, updates in ((0.0, 0.0, 0), (50.0, 0.1, 1), (60.0, 0.3, 101)):
+        meter.enter(seconds, fraction, updates)
+    assert meter.updates_per_second == 10.0
+    assert meter.seconds_left == pytest.approx(35.0)
+
+
+def test_a_name_is_for_one_variant(tmp_path: Path) -> None:
+    (cell,) = make_grid(["A-v0"], ["sac"], "quick", [3], tmp_path, overrides={"polyak_rate": 0.1}, name="sac-fast")
+    assert cell.folder == tmp_path / "A-v0/sac-fast/quick/seed-3"
+    with pytest.raises(UserError, match=r"name = 'mine': .*and here are 2"):
+        make_grid(["A-v0"], ["sac", "averaged"], "quick", [3], tmp_path, name="mine")
+
+
+def test_seeds_are_counted_or_named_or_the_protocols() -> None:
+    assert list(seed_numbers(None, "paper")) == [0, 1, 2, 3, 4]
+    assert list(seed_numbers(2, "quick", first=7)) == [7, 8]
+    assert list(seed_numbers([4, 9], "quick")) == [4, 9]
+    with pytest.raises(UserError, match="seeds = 0"):
+        seed_numbers(0, "quick")
+    with pytest.raises(UserError, match="did you mean 'quick'"):
+        seed_numbers(None, "quik")

@@ -14,10 +14,11 @@ import pytest
 from resume.helpers import assert_same_run, lines_of, run, start, wait_for
 
 from saclab.errors import UserError
-from saclab.grid import ray
+from saclab.grid.cluster import Cluster
 from saclab.grid.launch import launch
+from saclab.grid.local import local_pool
 from saclab.grid.plan import Cell, make_grid
-from saclab.grid.ray import Cluster
+from saclab.grid.ray import ray_pool
 from saclab.grid.tasks import RunStatus
 from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.requests import Requests
@@ -49,11 +50,11 @@ def grid(runs: Path) -> list[Cell]:
 
 
 def on_ray(cells: list[Cell], requests: Requests | None = None) -> Iterator[list[RunStatus]]:
-    return ray.launch(cells, None, 1, requests or Requests(), OFTEN, cluster=HERE)
+    return launch(cells, ray_pool(HERE, 1, OFTEN), requests or Requests())
 
 
 def finish_locally(cells: list[Cell]) -> list[RunStatus]:
-    *_, statuses = launch(cells, workers=2, threads=1, requests=Requests(), checkpoint_minutes=OFTEN)
+    *_, statuses = launch(cells, local_pool(2, 1, OFTEN), Requests())
     assert {status.status for status in statuses} == {"finished"}
     return statuses
 
@@ -107,7 +108,7 @@ def kill_worker(cell: Cell, victim: Callable[[int], int]) -> None:
     wait_for(lambda: is_dead(worker), seconds=1)
 
 
-def test_a_grid_whose_processes_are_killed_ends_with_the_bits_of_local_workers(tmp_path, straight, capfd):
+def test_killed_processes_change_no_bit_of_a_grid(tmp_path, straight, capfd):
     cells = grid(tmp_path)
     victims = {cells[0].folder: ray_process, cells[1].folder: lambda worker: worker}
     statuses: list[RunStatus] = []
@@ -118,24 +119,24 @@ def test_a_grid_whose_processes_are_killed_ends_with_the_bits_of_local_workers(t
     assert [status.status for status in statuses] == ["finished", "finished"]
     assert [len(status.warnings) for status in statuses] == [1, 1]
     assert "worker was lost (ActorDiedError: " in statuses[0].warnings[0]
-    assert "worker was lost (it was killed)" in statuses[1].warnings[0]
+    assert "worker was lost (killed by SIGKILL)" in statuses[1].warnings[0]
     for cell in cells:
         assert [line["from_step"] > 1000 for line in sessions(cell)] == [False, True]
     assert capfd.readouterr() == ("", ""), "Ray has said nothing"
     assert_same_grid(cells, straight)
 
 
-def test_a_batch_whose_process_is_killed_ends_with_the_bits_of_a_local_batch(tmp_path):
+def test_a_killed_process_changes_no_bit_of_a_run_group(tmp_path):
     """Its environments' processes end with it."""
     settings = {**SETTINGS, "max_updates": 6000, "acting_delay": 1}
     here, there = (
         make_grid(["Pendulum-v1"], ["sac", "sac-auto"], "quick", [0], tmp_path / name, overrides=settings)
         for name in ("local", "ray")
     )
-    *_, statuses = launch(here, workers=1, threads=1, requests=Requests(), checkpoint_minutes=OFTEN, batch=2)
+    *_, statuses = launch(here, local_pool(1, 1, OFTEN, batch=2), Requests(), batch=2)
     assert {status.status for status in statuses} == {"finished"}
     killed = False
-    for statuses in ray.launch(there, None, 1, Requests(), OFTEN, 2, HERE):  # noqa: B007
+    for statuses in launch(there, ray_pool(HERE, 1, OFTEN), Requests(), batch=2):  # noqa: B007
         if not killed and all(trained_a_while(cell) for cell in there):
             killed = True
             kill_worker(there[0], ray_process)
@@ -144,7 +145,7 @@ def test_a_batch_whose_process_is_killed_ends_with_the_bits_of_a_local_batch(tmp
     assert_same_grid(there, here)
 
 
-def test_a_grid_that_is_stopped_on_ray_is_finished_by_local_workers_to_the_same_bits(tmp_path, straight):
+def test_local_workers_finish_what_was_stopped_on_ray(tmp_path, straight):
     cells, requests = grid(tmp_path), Requests()
     statuses: list[RunStatus] = []
     for statuses in on_ray(cells, requests):  # noqa: B007 - the last ones are looked at
@@ -179,7 +180,7 @@ def test_the_run_of_a_lost_machine_goes_on_at_another(tmp_path, straight):
         second = machines.add_node(num_cpus=1)
         cells, statuses = grid(tmp_path), []
         cluster = Cluster(machines.address)
-        for statuses in ray.launch(cells, None, 1, Requests(), OFTEN, cluster=cluster):  # noqa: B007
+        for statuses in launch(cells, ray_pool(cluster, 1, OFTEN), Requests()):  # noqa: B007
             if second is not None and all(trained_a_while(cell) for cell in cells):
                 machines.remove_node(second, allow_graceful=False)
                 second = None
@@ -225,10 +226,10 @@ def test_nothing_writes_on_once_the_command_is_killed(tmp_path, straight):
 def test_a_cluster_that_is_not_there_or_too_small_is_a_users_error(tmp_path):
     began = time.monotonic()
     with pytest.raises(UserError, match=r"127\.0\.0\.1:1"):
-        next(ray.launch(grid(tmp_path), None, 1, Requests(), cluster=Cluster("127.0.0.1:1")))
+        next(launch(grid(tmp_path), ray_pool(Cluster("127.0.0.1:1"), 1), Requests()))
     with pytest.raises(UserError, match="host:port"):
-        next(ray.launch(grid(tmp_path), None, 1, Requests(), cluster=Cluster("somewhere")))
+        next(launch(grid(tmp_path), ray_pool(Cluster("somewhere"), 1), Requests()))
     with pytest.raises(UserError, match=r"1000 cores and 0 GPUs .*--ray-cpus"):
-        next(ray.launch(grid(tmp_path), None, 1, Requests(), cluster=Cluster("local", cpus=1000)))
+        next(launch(grid(tmp_path), ray_pool(Cluster("local", cpus=1000), 1), Requests()))
     assert time.monotonic() - began < 60
     assert not list(tmp_path.iterdir())

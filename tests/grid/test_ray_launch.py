@@ -15,8 +15,11 @@ import pytest
 from saclab import api
 from saclab.errors import SettingError, UserError
 from saclab.grid import ray as ray_launch
+from saclab.grid.cluster import Cluster, chosen_cluster
+from saclab.grid.launch import LOSSES
+from saclab.grid.launch import launch as launch_grid
 from saclab.grid.plan import Cell, make_grid
-from saclab.grid.ray import LOSSES, Cluster, chosen_cluster, worker_variables
+from saclab.grid.ray import ray_pool, worker_variables
 from saclab.grid.tasks import RunStatus
 from saclab.training.requests import Requests
 
@@ -98,7 +101,7 @@ def launch(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Ite
             yield ray
 
         monkeypatch.setattr(ray_launch, "connected", connected)
-        return ray_launch.launch(grid(tmp_path), workers, threads=1, requests=requests or Requests())
+        return launch_grid(grid(tmp_path), ray_pool(Cluster(), 1, workers=workers), requests or Requests())
 
     return on
 
@@ -130,7 +133,7 @@ def test_a_worker_that_the_system_kills_or_stops_is_lost_too(launch, code):
     assert set(ray.workers.values()) == {2}
 
 
-def test_a_run_that_loses_its_workers_and_gets_nowhere_fails_and_does_not_stop_the_others(launch):
+def test_a_run_that_keeps_losing_workers_fails_alone(launch):
     def answer(folder: Path, number: int) -> dict[str, Any]:
         if "sac-auto" in folder.parts:
             raise Lost("bad luck")
@@ -190,7 +193,7 @@ def test_no_more_tasks_are_on_the_cluster_than_asked_for(launch):
     assert ray.most_alive == 1
 
 
-def test_settings_of_ray_are_refused_for_local_workers_and_where_they_cannot_work():
+def test_settings_of_ray_are_refused_where_they_cannot_work():
     assert chosen_cluster("local", 1, None, None, 0.0) is None
     assert chosen_cluster("ray", 3, None, None, 0.0) == Cluster(None, 3, 0.0)
     assert chosen_cluster("ray", 3, "somewhere:6379", 0.5, 0.25) == Cluster("somewhere:6379", 0.5, 0.25)

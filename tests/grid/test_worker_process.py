@@ -21,7 +21,7 @@ CHILD = "import os, sys, time; sys.path[:0] = {path!r}; from saclab.grid.worker_
 def worker(folder: Path, program: str, monkeypatch: pytest.MonkeyPatch) -> WorkerProcess:
     """A worker process that runs this in place of training."""
     (folder / "sitecustomize.py").write_text(f"import os, sys, time\n{program}\nsys.stdout.flush()\nos._exit(0)\n")
-    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
     return WorkerProcess({"runs": [{"folder": str(folder / "run")}]}, {"THREADS": "3"}, str(folder))
 
 
@@ -57,7 +57,7 @@ def test_a_worker_dies_at_once_with_its_launcher():
     wait_for(lambda: not state.exists() or ") Z" in state.read_text(), seconds=2)
 
 
-def test_a_worker_that_outlived_its_launcher_before_it_could_ask_does_not_begin():
+def test_a_worker_whose_launcher_is_gone_does_not_begin():
     child = CHILD.format(path=sys.path, then="die_with(1); print('begun')")
     ended = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (1, "")

@@ -3,7 +3,9 @@
 import pytest
 
 from saclab.errors import UserError
-from saclab.report.runs import all_notices, notices, read_comparison, scale_notice, shown
+from saclab.report.notices import all_notices, notices, scale_notice
+from saclab.report.runs import read_comparison
+from saclab.report.text import shown
 from saclab.training.run_folder import read_run
 
 from .synthetic import write_run
@@ -40,7 +42,7 @@ def test_groups_by_environment_variant_and_seed(tmp_path):
 )
 def test_refuses_what_differs_and_names_it(tmp_path, change, named):
     runs = [write_run(tmp_path, "sac", seed) for seed in (0, 1)]
-    runs.append(write_run(tmp_path, "averaged", 0, name="other", **change))
+    runs.append(write_run(tmp_path, "averaged", 0, **change))
     with pytest.raises(UserError, match=f"^not comparable: {named}") as refused:
         read_comparison(runs)
     assert str(runs[-1]) in str(refused.value)
@@ -60,7 +62,8 @@ def test_two_versions_of_one_environment_are_refused(tmp_path):
 
 def test_allowed_mixed_runs_stand_apart_and_are_labelled(tmp_path):
     runs = [write_run(tmp_path, "averaged", seed) for seed in (0, 1)]
-    runs += [write_run(tmp_path, "averaged", seed, name="far", overrides={"snapshot_interval": 200}) for seed in (0, 1)]
+    far = {"snapshot_interval": 200}
+    runs += [write_run(tmp_path / "far", "averaged", seed, overrides=far) for seed in (0, 1)]
     comparison = read_comparison(runs, allow_mixed=True)
     assert [arm.name for arm in comparison.arms] == ["averaged", "averaged (snapshot_interval 200)"]
     assert [len(group) for group in comparison.groups.values()] == [2, 2]
@@ -80,7 +83,7 @@ def test_unknown_variant_is_grouped_by_its_settings(tmp_path):
     runs = [write_run(tmp_path / str(seed), "sac", seed, rename={"variant": "mine"}) for seed in (0, 1)]
     runs.append(write_run(tmp_path, "sac", 0))
     assert [len(group) for group in read_comparison(runs).groups.values()] == [2, 1]
-    runs.append(write_run(tmp_path, "averaged", 2, rename={"variant": "mine"}))
+    runs.append(write_run(tmp_path, "averaged", 2, rename={"variant": "mine"}, name="sac"))
     with pytest.raises(UserError, match=r"snapshots is 10 in .* and 1 in"):
         read_comparison(runs)
 
@@ -113,7 +116,7 @@ def test_scaled_down_runs_are_noticed(tmp_path, options, said):
 def test_unfinished_and_untested_runs_are_noticed(tmp_path):
     runs = [write_run(tmp_path, "sac", 0), write_run(tmp_path, "sac", 1, finished=False, evaluations=0)]
     comparison = read_comparison(runs)
-    assert notices(comparison.runs) == ("1 of 2 runs unfinished", "1 of 2 runs without a test so far")
+    assert notices(comparison.runs) == ("1 of 2 runs unfinished", "1 of 2 runs without an evaluation so far")
     more = read_comparison([*runs, write_run(tmp_path, environment="Humanoid-v4", overrides=SHORT)])
     assert "Humanoid-v4: Scaled down: 60,000 of 1,500,000 updates of the paper protocol" in all_notices(more)
 

@@ -1,4 +1,4 @@
-"""From test returns to scores, by hand."""
+"""From evaluation returns to scores, by hand."""
 
 import math
 
@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from saclab.report.runs import read_comparison
-from saclab.report.scores import (
-    MORE_SEEDS,
-    ONE_SEED,
-    aggregate,
-    common_horizon,
-    environment_sentences,
-    number_text,
-    score_environment,
-)
+from saclab.report.scores import aggregate, common_horizon, score_environment
+from saclab.report.sentences import MORE_SEEDS, ONE_SEED, environment_sentences
+from saclab.report.text import number_text
 
 from .synthetic import write_run
 
@@ -27,12 +21,12 @@ def test_scores_of_one_run_by_hand(tmp_path):
     returns = [100.0 * index for index in range(1, 21)]
     entry = scores_of([write_run(tmp_path, returns=returns)])
     (run,) = entry.arms[0].runs
-    assert run.final == 1950.0  # the last two of twenty tests
+    assert run.final == 1950.0  # the last two of twenty evaluations
     assert run.best == 2000.0
     assert run.area == pytest.approx(1050.0)
-    assert run.tests == 20
+    assert run.evaluations == 20
     assert entry.threshold == 1950.0
-    assert run.steps_to_threshold == 200_000  # the test at 2000
+    assert run.steps_to_threshold == 200_000  # the evaluation at 2000
     assert not entry.arms[0].final.exists
     assert entry.arms[0].paper_best == 10182.9
 
@@ -48,6 +42,21 @@ def test_pairs_use_equal_seeds_and_all_pairs(tmp_path):
     assert pair.improvement.estimate == pytest.approx(4 / 9)  # sac above averaged: 10>5, 20>5, 30>25, 30>5
     assert pair.improvement.paired[:1] == (0.0,)
     assert pair.improvement.paired.runs == 2
+
+
+def test_pairs_are_compared_by_final_return_and_by_area(tmp_path):
+    """Three evaluations each, 10,000 steps apart: sac rises late, averaged early, and both end at the same levels."""
+    curves = {"sac": (0.0, 0.0, 10.0), "averaged": (0.0, 10.0, 10.0)}
+    folders = [
+        write_run(tmp_path, variant, seed, returns=[value + 2 * seed for value in curve])
+        for variant, curve in curves.items() for seed in (0, 1)
+    ]  # fmt: skip
+    (pair,) = scores_of(folders).pairs
+    assert pair.final.improvement.estimate == 0.5
+    assert pair.final.difference.estimate == 0.0
+    assert pair.area.improvement.estimate == 0.0  # (0 + 5) / 2 = 2.5 and 4.5; (5 + 10) / 2 = 7.5 and 9.5
+    half = 4.302652729911275 * 2**0.5  # t(0.975, ν = 2) · √(2/2 + 2/2), the variance of two seeds 2 apart being 2
+    assert pair.area.difference == pytest.approx((-5.0, -5.0 - half, -5.0 + half, 2))
 
 
 def test_unfinished_runs_cut_all_to_their_length(tmp_path):
@@ -74,10 +83,10 @@ def test_different_budgets_are_cut_to_the_shortest(tmp_path):
     assert common_horizon(read_comparison(folders, allow_mixed=True).runs) == 20_000
 
 
-def test_without_tests_there_is_nothing_to_compare(tmp_path):
+def test_without_evaluations_there_is_nothing_to_compare(tmp_path):
     entry = scores_of([write_run(tmp_path, "sac", seed, evaluations=0, finished=False) for seed in (0, 1)])
     assert entry.arms[0].runs == ()
-    assert environment_sentences(entry) == ["No run has a test so far, so there is nothing to compare."]
+    assert environment_sentences(entry) == ["No run has an evaluation so far, so there is nothing to compare."]
 
 
 def test_returns_that_are_not_numbers_do_not_count(tmp_path):
@@ -86,10 +95,11 @@ def test_returns_that_are_not_numbers_do_not_count(tmp_path):
 
 
 def test_few_seeds_are_warned_of(tmp_path):
-    folders = [write_run(tmp_path, variant, seed) for variant in ("sac", "averaged") for seed in (0, 1)]
+    folders = [write_run(tmp_path, variant, seed, returns=[level + seed])
+               for variant, level in (("sac", 10.0), ("averaged", 10.5)) for seed in (0, 1)]  # fmt: skip
     text = " ".join(environment_sentences(scores_of(folders)))
     assert "fewer than 5 seeds" in text
-    assert "2 seeds cannot tell sac and averaged apart" in text or "2 seeds cannot tell averaged and sac apart" in text
+    assert "2 seeds cannot tell averaged and sac apart (P = 0.75 " in text
 
 
 @pytest.mark.parametrize("variants", [("sac", "averaged"), ("sac", "sac-auto", "averaged", "averaged-auto")])
@@ -100,7 +110,7 @@ def test_one_seed_each_allows_no_conclusion_and_says_how_to_get_one(tmp_path, va
     assert "no conclusion" in first
     assert "--seeds 5" in first
     levels = "; ".join(f"{variant} {number_text(1000 + len(variant))}" for variant in variants)
-    assert second == f"Final test return (one seed, no interval): {levels}."
+    assert second == f"Final evaluation return (one seed, no interval): {levels}."
 
 
 def test_variants_of_one_seed_among_others_take_one_sentence(tmp_path):

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from saclab.api import Comparison
 from saclab.config import TrainingSettings
+from saclab.grid.rate import RateMeter
 from saclab.grid.tasks import RunStatus
 from saclab.signals import EXIT_STATUS
 from saclab.training import events
@@ -35,28 +36,10 @@ def number(value: float | None) -> str:
     return "–" if value is None else f"{value:.1f}"
 
 
-class RateMeter:
-    """Updates per second and time left since the first update of this session."""
-
-    def __init__(self) -> None:
-        self.began: events.Progress | None = None
-        self.rate = 0.0
-        self.seconds_left: float | None = None
-
-    def enter(self, progress: events.Progress) -> None:
-        if self.began is None:
-            self.began = progress if progress.updates > 0 else None
-            return
-        seconds, share = progress.seconds - self.began.seconds, progress.fraction - self.began.fraction
-        if seconds > 0 and share > 0:
-            self.rate = (progress.updates - self.began.updates) / seconds
-            self.seconds_left = (1 - progress.fraction) * seconds / share
-
-
 def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[events.Event]:
-    """Pass a run's events on, and show them: a bar with rate and time left, one line per test."""
+    """Pass a run's events on, and show them: a bar with rate and time left, one line per evaluation."""
     columns = (BarColumn(bar_width=30), TaskProgressColumn(), TextColumn("{task.description}"))
-    meter, test_return = RateMeter(), None
+    meter, evaluation_return = RateMeter(), None
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("random steps", total=1.0)
         for event in stream:
@@ -67,19 +50,19 @@ def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[event
                     for note in event.notes:
                         console.print(f"  {escape(note)}", soft_wrap=True)
                 case events.Progress():
-                    meter.enter(event)
+                    meter.enter(event.seconds, event.fraction, event.updates)
                     bar.update(task, completed=event.fraction, description=(
-                        f"step {event.steps:,} · update {event.updates:,} · {meter.rate:.0f} updates/s · "
-                        f"{duration(meter.seconds_left)} left · test return {number(test_return)}"
+                        f"step {event.steps:,} · update {event.updates:,} · {meter.updates_per_second:.0f} updates/s · "
+                        f"{duration(meter.seconds_left)} left · evaluation return {number(evaluation_return)}"
                     ))  # fmt: skip
                 case events.Evaluated():
-                    test_return = float(event.total_rewards.mean())
+                    evaluation_return = float(event.total_rewards.mean())
                     spread = float(event.total_rewards.std())
                     console.print(
                         f"step {event.steps:>9,}  update {event.updates:>9,}  episode {event.episodes:>6,}  "
-                        f"test return {test_return:9.1f} ± {spread:.1f} over {len(event.total_rewards)}"
+                        f"evaluation return {evaluation_return:9.1f} ± {spread:.1f} over {len(event.total_rewards)}"
                         + ("  best" if event.best else "")
-                        + f"  ({meter.rate:.0f} updates/s, {duration(meter.seconds_left)} left)",
+                        + f"  ({meter.updates_per_second:.0f} updates/s, {duration(meter.seconds_left)} left)",
                         soft_wrap=True,
                     )
                 case events.Warned():
@@ -87,7 +70,7 @@ def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[event
                 case events.Finished():
                     console.print(
                         f"finished: {event.reason}; {event.steps:,} steps, {event.updates:,} updates, "
-                        f"{event.episodes:,} episodes; best test return {event.best_return:.1f}, "
+                        f"{event.episodes:,} episodes; best evaluation return {event.best_return:.1f}, "
                         f"last {event.final_return:.1f}",
                         soft_wrap=True,
                     )
@@ -113,16 +96,17 @@ def show_grid(stream: Iterable[Sequence[RunStatus]], console: Console) -> list[R
 
 
 def run_name(status: RunStatus) -> str:
-    config = status.cell.config
-    return f"{config.environment} {config.variant} seed {config.seed}"
+    """Environment, variant or the name in its place, and seed."""
+    config, folder = status.cell
+    return f"{config.environment} {folder.parts[-3]} seed {config.seed}"
 
 
 def grid_line(statuses: Sequence[RunStatus]) -> str:
     """One plain line: how many runs are done, and where the running ones are."""
     finished = sum(status.status == "finished" for status in statuses)
     running = [
-        f"{run_name(status)}: {status.fraction:.0%}, {status.updates_per_second:.0f} updates/s, "
-        f"{duration(status.seconds_left)} left, test return {number(status.test_return)}"
+        f"{run_name(status)}: {status.fraction:.0%}, {status.meter.updates_per_second:.0f} updates/s, "
+        f"{duration(status.meter.seconds_left)} left, evaluation return {number(status.evaluation_return)}"
         for status in statuses
         if status.status == "running"
     ]
@@ -133,7 +117,7 @@ def grid_table(statuses: Sequence[RunStatus], rows: int) -> Table:
     """One line per run, the running ones first where not all fit."""
     table = Table(box=None, header_style="bold")
     table.add_column("run", overflow="fold")
-    for title in ("state", "done", "updates/s", "left", "test return"):
+    for title in ("state", "done", "updates/s", "left", "evaluation return"):
         table.add_column(title, justify="right", no_wrap=True)
     order = {"running": 0, "failed": 1, "waiting": 2, "interrupted": 2, "finished": 3}
     shown = statuses if len(statuses) <= rows else sorted(statuses, key=lambda status: order[status.status])[:rows]
@@ -141,8 +125,8 @@ def grid_table(statuses: Sequence[RunStatus], rows: int) -> Table:
     for status in shown:
         table.add_row(
             escape(run_name(status)), f"[{colours.get(status.status, 'default')}]{status.status}[/]",
-            f"{status.fraction:.0%}", f"{status.updates_per_second:.0f}", duration(status.seconds_left),
-            number(status.test_return),
+            f"{status.fraction:.0%}", f"{status.meter.updates_per_second:.0f}", duration(status.meter.seconds_left),
+            number(status.evaluation_return),
         )  # fmt: skip
     if len(shown) < len(statuses):
         table.add_row(f"… and {len(statuses) - len(shown)} more")
@@ -159,7 +143,7 @@ def show_comparison(result: Comparison, console: Console) -> int:
     if result.report:
         cells = [(run.config.environment, run.config.variant) for run in result.runs]
         if len({variant for _, variant in cells}) > 1 and len(set(cells)) == len(cells):
-            from saclab.report.scores import ONE_SEED  # the table above looks like a ranking, and is none
+            from saclab.report.sentences import ONE_SEED  # the table above looks like a ranking, and is none
 
             console.print(ONE_SEED, highlight=False, soft_wrap=True)
         console.print(f"report: {result.report.resolve()}", markup=False, soft_wrap=True)

@@ -10,20 +10,10 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from saclab.cli.commands import (
-    EXIT_USER_ERROR,
-    Compare,
-    Evaluate,
-    Protocols,
-    Record,
-    Report,
-    Reproduce,
-    Resume,
-    Train,
-    Variants,
-)
+from saclab.cli.results import Evaluate, Protocols, Record, Report, Variants
+from saclab.cli.settings import with_settings
+from saclab.cli.training import EXIT_USER_ERROR, Compare, Reproduce, Resume, Train
 from saclab.errors import UserError
-from saclab.protocols import make_config
 from saclab.signals import EXIT_STATUS
 
 
@@ -47,28 +37,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """The command that the words ask for, its settings by default those of its environment, variant and protocol.
-
-    The three are guessed first, so that --help shows the values that a run would have; if the whole line then says
-    something else, such as after `--seed 3 Humanoid-v4`, it is parsed again with what it said.
-    """
-    words = [word for word in arguments[1:] if not word.startswith("-")]
-    variant, protocol = (option_value(arguments, name) for name in ("variant", "protocol"))
-    guess = (words[0] if words else "HalfCheetah-v4", variant or "sac-auto", protocol or "standard")
-    command = parse_with_defaults(arguments, *guess)
-    if isinstance(command, Train) and guess != (said := (command.environment, command.variant, command.protocol)):
-        command = parse_with_defaults(arguments, *said)
-    return command
-
-
-def parse_with_defaults(arguments: Sequence[str], environment: str, variant: str, protocol: str) -> Any:
-    config = make_config(environment, variant, protocol)
-    given = frozenset(word[2:].partition("=")[0].replace("-", "_") for word in arguments if word.startswith("--"))
-    train = Train(tyro.MISSING, config.algorithm, config.training)
-    compare = Compare(tyro.MISSING, config.algorithm, config.training, given=given)
+    """The command that the words ask for."""
+    train, compare = with_settings(Train, arguments), with_settings(Compare, arguments)
     commands: Any = (
-        Annotated[Train, subcommand("train", default=train)]
-        | Annotated[Compare, subcommand("compare", default=compare)]
+        Annotated[train, subcommand("train")]
+        | Annotated[compare, subcommand("compare")]
         | Annotated[Reproduce, subcommand("reproduce")]
         | Annotated[Resume, subcommand("resume")]
         | Annotated[Report, subcommand("report")]
@@ -79,13 +52,3 @@ def parse_with_defaults(arguments: Sequence[str], environment: str, variant: str
     )
     description = "A laboratory for Soft Actor-Critic: train its variants, compare them, reproduce the paper."
     return tyro.cli(commands, prog="saclab", description=description, args=list(arguments))
-
-
-def option_value(arguments: Sequence[str], name: str) -> str | None:
-    """The value of --name in either of its forms, before the whole line is parsed."""
-    for index, word in enumerate(arguments):
-        if word == f"--{name}" and index + 1 < len(arguments):
-            return arguments[index + 1]
-        if word.startswith(f"--{name}="):
-            return word.partition("=")[2]
-    return None

@@ -1,4 +1,4 @@
-"""Which runs of a grid are trained together as one batch."""
+"""Which runs of a grid are trained together, as one run group."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FREE = (
 NO_CHECKPOINT = -1  # in place of a step: one of step 0 is something else
 
 
-class Group(NamedTuple):
-    """Runs that make one batch."""
+class RunGroup(NamedTuple):
+    """Runs that are trained together."""
 
     members: list[int]
-    """Their places in the sequence that was given."""
+    """Places of the runs in the sequence that was given."""
     slots: int
-    """Of the batch: as many as runs, or as the batch had from which they are continued."""
+    """As many as runs, or as the run group had from which they are continued."""
 
 
 def structure(config: Config) -> str:
@@ -37,7 +37,7 @@ def structure(config: Config) -> str:
     return json.dumps([config.environment, config.environment_arguments, algorithm, training], sort_keys=True)
 
 
-def batches(cells: Sequence[Cell], size: int) -> list[Group]:
+def run_groups(cells: Sequence[Cell], size: int) -> list[RunGroup]:
     """Groups of at most `size` unfinished cells of the same structure that have come equally far, in their order."""
     kinds: dict[str, list[int]] = {}
     for index, cell in enumerate(cells):
@@ -46,12 +46,12 @@ def batches(cells: Sequence[Cell], size: int) -> list[Group]:
     for members in kinds.values():
         for equally_far in by_progress(cells, members):
             parts = [equally_far[first : first + size] for first in range(0, len(equally_far), size)]
-            groups += [Group(part, max(len(part), min(size, slots_before(cells, part)))) for part in parts]
+            groups += [RunGroup(part, max(len(part), min(size, slots_before(cells, part)))) for part in parts]
     return sorted(groups, key=lambda group: group.members)
 
 
 def by_progress(cells: Sequence[Cell], members: Sequence[int]) -> list[list[int]]:
-    """Parts that have a checkpoint of the same step, or none at all; the runs of a batch are always equally far.
+    """Parts that have a checkpoint of the same step, or none at all; the runs of a group are always equally far.
 
     A process that was killed while it saved leaves the newest checkpoint in some of its runs only; the one before
     is in all of them, as two are kept. A run that has failed would only hold up the others, or fail with them again.
@@ -69,5 +69,5 @@ def by_progress(cells: Sequence[Cell], members: Sequence[int]) -> list[list[int]
 
 
 def slots_before(cells: Sequence[Cell], members: Sequence[int]) -> int:
-    """Slots of the batch in which these runs were last; 0 if they were in none."""
+    """Slots of the run group in which these runs were last; 0 if they were in none."""
     return max(batch_slots(cells[index].folder) for index in members)

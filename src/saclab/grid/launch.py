@@ -1,28 +1,25 @@
-"""Train the runs of a grid in local worker processes: one process per run, one core each by default."""
+"""The loop that trains a grid: it hands out tasks, listens, stops, and lets the runs of lost workers go on."""
 
 from __future__ import annotations
 
-import os
-import selectors
+import signal
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
 
 from saclab.grid.plan import Cell
+from saclab.grid.pool import End, WorkerPool
 from saclab.grid.tasks import RunStatus, Task, make_statuses, make_tasks
-from saclab.grid.worker_process import WorkerProcess
-from saclab.machine import thread_limits, usable_cores
+from saclab.grid.worker_process import how_it_ended
+from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.requests import Requests
 
-POLL_SECONDS = 0.25
+LOSSES = 3  # of a run's worker without a new checkpoint in between; one more, and the run has failed
 
 
 def launch(
-    cells: Sequence[Cell],
-    workers: int,
-    threads: int,
-    requests: Requests,
-    checkpoint_minutes: float = 10,
-    batch: int = 0,
+    cells: Sequence[Cell], pool: AbstractContextManager[WorkerPool], requests: Requests, batch: int = 0
 ) -> Iterator[list[RunStatus]]:
     """Train every unfinished cell; yields all statuses several times a second.
 
@@ -31,65 +28,104 @@ def launch(
 
     Args:
         cells: the runs of the grid.
-        workers: runs at a time; of a batch, which has the machine to itself, the processes that step environments.
-        threads: cores that XLA uses in each worker.
+        pool: where they are trained; `saclab.grid.local.local_pool` or `saclab.grid.ray.ray_pool` makes one.
         requests: asks the grid to stop.
-        checkpoint_minutes: wall-clock time between checkpoints.
-        batch: how many runs of the same structure are trained as one batch; 0 for each run alone.
+        batch: how many runs of the same structure are trained as one run group; 0 for each run alone.
+
+    Raises:
+        UserError: if the pool cannot be made.
     """
     statuses = make_statuses(cells)
-    waiting = make_tasks(statuses, batch)
-    at_once = workers if batch == 0 else 1
-    running: dict[int, Worker] = {}
-    free_cores = core_groups(at_once, threads)
-    stopping = False
-    with selectors.DefaultSelector() as selector:
-        try:
-            while running or (waiting and not requests.stop):
-                while waiting and len(running) < at_once and not requests.stop:
-                    task, cores = waiting.pop(0), free_cores.pop(0)
-                    task.start()
-                    process = WorkerProcess(task.to_dict(checkpoint_minutes, cores, workers), thread_limits(threads))
-                    running[process.output.fileno()] = Worker(task, process, cores)
-                    selector.register(process.output, selectors.EVENT_READ)
-                if requests.stop and not stopping:
-                    stopping = True
-                    for worker in running.values():
-                        worker.process.stop()
-                for key, _ in selector.select(POLL_SECONDS):
-                    task, process, cores = running[key.fd]
-                    for message in process.read():
-                        task.enter(message)
-                    if process.silent:
-                        selector.unregister(process.output)
-                        del running[key.fd]
-                        free_cores.append(cores)
-                        code, errors = process.ended()
-                        task.ended(code, stopping, errors)
-                yield statuses
-        finally:
-            for worker in running.values():
-                worker.process.stop()
-            for worker in running.values():
-                worker.process.finish()
+    with pool as workers:
+        grid = Grid(workers, make_tasks(statuses, batch), batch)
+        grid.note()
+        while grid.running or (grid.waiting and not requests.stop):
+            if requests.stop:
+                grid.stop()
+            else:
+                grid.start()
+            grid.listen()
+            yield statuses
     yield statuses
 
 
-class Worker(NamedTuple):
-    """A task, the process that trains it, and the cores that it keeps to."""
+@dataclass
+class Grid:
+    """The tasks of a grid: those that wait here, and those that the pool has been given."""
 
-    task: Task
-    process: WorkerProcess
-    cores: list[int]
+    pool: WorkerPool
+    waiting: list[Task]
+    batch: int
+    running: list[Task] = field(default_factory=list)
+    losses: dict[Path, tuple[int, int]] = field(default_factory=dict)
+    """Run folder -> workers lost since its newest checkpoint, and that one's step."""
+    stopping: bool = False
 
+    def note(self) -> None:
+        """Let the waiting runs say what the pool has to say of them."""
+        for task in self.waiting:
+            for run in task.runs:
+                run.warnings += [self.pool.note] if self.pool.note else []
 
-def core_groups(workers: int, threads: int) -> list[list[int]]:
-    """The cores that each worker keeps to; empty lists leave them to the system.
+    def start(self) -> None:
+        """Hand waiting tasks to the pool, as far as it has places."""
+        while self.waiting and (self.pool.places is None or len(self.running) < self.pool.places):
+            task = self.waiting.pop(0)
+            self.running.append(task)
+            if self.pool.start(task):
+                task.start()
 
-    Only workers that fill the machine are held to their cores: the process that steps the environments and XLA's
-    thread then share one, and its cache. Fewer would meet those of another grid on the same cores.
-    """
-    cores = usable_cores()
-    if len(cores) != workers * threads or not hasattr(os, "sched_setaffinity"):
-        return [[] for _ in range(workers)]
-    return [cores[first : first + threads] for first in range(0, len(cores), threads)]
+    def stop(self) -> None:
+        """Let every worker save and stop, and take back the tasks that wait for room."""
+        if self.stopping:
+            return
+        self.stopping = True
+        self.running = [task for task in self.running if self.pool.stop(task)]
+
+    def listen(self) -> None:
+        """Take in what the workers say, and how they end."""
+        for task, messages, end in self.pool.poll():
+            lost = end is not None and end.code is None
+            if not (task.started or lost):
+                task.start()
+            for message in messages:
+                task.enter(message)
+            if end is not None:
+                self.running.remove(task)
+                self._ended(task, end)
+
+    def _ended(self, task: Task, end: End) -> None:
+        """Note the end of a worker; if somebody else than this grid has killed or stopped it, it may be replaced."""
+        if end.code is None:
+            self._lost(task, end.words)
+            return
+        replaced = self.pool.replaces_lost and not self.stopping
+        if replaced and end.code == -signal.SIGKILL:
+            self._lost(task, how_it_ended(end.code, end.words))
+            return
+        task.ended(end.code, self.stopping, end.words)
+        if replaced and any(run.status in ("running", "interrupted") for run in task.runs):
+            self._lost(task, "told to stop")
+
+    def _lost(self, task: Task, why: str) -> None:
+        """Let the runs that have not ended wait for another worker."""
+        for run in task.runs:
+            if run.cell.finished:
+                run.status, run.fraction = "finished", 1.0
+            elif run.status == "running" and self.stopping:
+                run.status = "interrupted"
+            elif run.status != "failed" and not self.stopping:
+                self._wait_again(run, why)
+        self.waiting[:0] = make_tasks(task.runs, self.batch)
+
+    def _wait_again(self, run: RunStatus, why: str) -> None:
+        """Let a run wait, or fail if this has happened too often since it got any further."""
+        step = max(checkpoint_steps(run.cell.folder), default=0)
+        before, last_step = self.losses.get(run.cell.folder, (0, step))
+        losses = before + 1 if step == last_step else 1
+        self.losses[run.cell.folder] = losses, step
+        if losses > LOSSES:
+            run.status = "failed"
+            run.message = f"its worker was lost {losses} times without a checkpoint in between ({why})"
+        else:
+            run.lose_worker(why)

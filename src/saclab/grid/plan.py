@@ -1,4 +1,4 @@
-"""The runs of a comparison: variants × environments × seeds."""
+"""The runs of a comparison: variants × environments × seeds, and whether they can be begun."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from saclab.config import Config
-from saclab.protocols import make_config
+from saclab.config import Config, require
+from saclab.protocols import make_config, protocol_row
 from saclab.training.run_folder import is_finished, run_path
 
 
@@ -26,22 +26,83 @@ def make_grid(
     environments: Sequence[str],
     variants: Sequence[str],
     protocol: str,
-    seeds: Sequence[int],
-    runs: Path,
+    seeds: int | Sequence[int] | None,
+    runs: Path | str,
     environment_arguments: Mapping[str, Any] | None = None,
     overrides: Mapping[str, Any] | None = None,
+    name: str | None = None,
 ) -> list[Cell]:
     """One cell per environment, seed and variant; all variants of a seed come before the next seed.
 
     So a grid that is stopped early holds whole comparisons of fewer seeds.
 
+    Args:
+        environments: Gymnasium ids.
+        variants: keys of `saclab.variants.VARIANTS`.
+        protocol: a key of `saclab.protocols.PROTOCOLS`.
+        seeds: as `seed_numbers` takes them.
+        runs: the folder that holds all runs.
+        environment_arguments: keyword arguments of every environment.
+        overrides: settings of every run by name.
+        name: takes the variant's place in the run folders' paths; for one variant only.
+
     Raises:
         UserError: for an unknown name or a value that cannot work.
     """
+    variants = tuple(dict.fromkeys(variants))
+    require(
+        name is None or len(variants) == 1, "name", name,
+        f"it is the name of one variant with other settings, and here are {len(variants)}: choose one with --variants",
+    )  # fmt: skip
     configs = [
         make_config(environment, variant, protocol, seed, environment_arguments, overrides)
-        for seed in seeds
+        for seed in seed_numbers(seeds, protocol)
         for environment in dict.fromkeys(environments)
-        for variant in dict.fromkeys(variants)
+        for variant in variants
     ]
-    return [Cell(config, run_path(runs, config)) for config in configs]
+    return [Cell(config, run_path(Path(runs), config, name)) for config in configs]
+
+
+def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 0) -> Sequence[int]:
+    """The seeds of a comparison.
+
+    Args:
+        seeds: how many, or which; None for the protocol's own number.
+        protocol: a key of `saclab.protocols.PROTOCOLS`.
+        first: the first of them, where it is said how many.
+
+    Raises:
+        UserError: for an unknown protocol, or no seed at all.
+    """
+    own = protocol_row(protocol).seeds
+    seeds = own if seeds is None else seeds
+    numbers = range(first, first + seeds) if isinstance(seeds, int) else seeds
+    require(len(numbers) >= 1, "seeds", seeds, "use at least 1")
+    return numbers
+
+
+def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
+    """Raise UserError before anything is started if an environment, a folder or the memory will not do.
+
+    Args:
+        cells: the grid.
+        at_once: runs whose replay buffers this machine's memory must hold together; 0 if they lie elsewhere.
+        fewer: the option that would lower their number.
+    """
+    from saclab.environments.make import environment_spec, make_environment
+    from saclab.replay import RowLayout, require_memory
+    from saclab.training.journal import require_same_config
+
+    checked = set()
+    for cell in cells:
+        if (cell.folder / "config.json").exists():
+            require_same_config(cell.folder, cell.config)
+        if cell.config.environment in checked:
+            continue
+        checked.add(cell.config.environment)
+        environment = make_environment(cell.config.environment, cell.config.environment_arguments)
+        spec = environment_spec(cell.config.environment, environment)
+        environment.close()
+        if at_once:
+            layout = RowLayout(spec.observation_size, spec.action_size)
+            require_memory(cell.config.training.replay_capacity, layout, at_once, fewer)

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from saclab.grid.groups import batches
+from saclab.grid.groups import run_groups
 from saclab.grid.plan import Cell
+from saclab.grid.rate import RateMeter
+from saclab.grid.worker_process import how_it_ended
 
 Status = Literal["waiting", "running", "finished", "interrupted", "failed"]
-ERROR_LINES = 30  # of a crashed worker's standard error, looked through for its last words
 
 
 @dataclass
@@ -24,24 +25,21 @@ class RunStatus:
     fraction: float = 0.0
     updates: int = 0
     episodes: int = 0
-    updates_per_second: float = 0.0
-    seconds_left: float | None = None
-    test_return: float | None = None
+    evaluation_return: float | None = None
     message: str = ""
     """Why it failed."""
     warnings: list[str] = field(default_factory=list)
     """What the run said of itself that the user should know."""
-    first_progress: tuple[float, float, int] | None = field(default=None, repr=False)
-    """Clock, fraction and updates when this session's first update had been made: compilation is not in the rate."""
+    meter: RateMeter = field(default_factory=RateMeter, repr=False)
 
     def enter(self, message: dict[str, object]) -> None:
         """Take in one line of the worker."""
         match message:
             case {"event": "progress", "fraction": float(fraction), "updates": int(updates), "episodes": int(episodes)}:
                 self.fraction, self.updates, self.episodes = fraction, updates, episodes
-                self._measure_rate(time.monotonic())
+                self.meter.enter(time.monotonic(), fraction, updates)
             case {"event": "evaluated", "mean_return": float(mean)}:
-                self.test_return = mean
+                self.evaluation_return = mean
             case {"event": "warned", "message": str(text)}:
                 self.warnings.append(text)
             case {"event": "finished"}:
@@ -54,26 +52,20 @@ class RunStatus:
     def lose_worker(self, why: str) -> None:
         """Wait for another worker, which goes on from the last checkpoint."""
         self.warnings.append(f"its worker was lost ({why}): continued from the last checkpoint")
-        self.status, self.first_progress, self.updates_per_second, self.seconds_left = "waiting", None, 0.0, None
-
-    def _measure_rate(self, now: float) -> None:
-        if self.first_progress is None:
-            if self.updates > 0:
-                self.first_progress = (now, self.fraction, self.updates)
-            return
-        began, fraction, updates = self.first_progress
-        if now > began and self.fraction > fraction:
-            self.updates_per_second = (self.updates - updates) / (now - began)
-            self.seconds_left = (1 - self.fraction) * (now - began) / (self.fraction - fraction)
+        self.status, self.meter = "waiting", RateMeter()
 
 
-@dataclass
+@dataclass(eq=False)
 class Task:
-    """A run alone, or runs that are trained as one batch."""
+    """A run alone, or runs that are trained as one run group."""
 
     runs: list[RunStatus]
     slots: int
-    """Of the batch, at least as many as runs; 0 for a run alone."""
+    """Places in the run group, at least as many as runs; 0 for a run alone."""
+
+    @property
+    def started(self) -> bool:
+        return self.runs[0].status != "waiting"
 
     def start(self) -> None:
         for run in self.runs:
@@ -87,7 +79,7 @@ class Task:
         Args:
             checkpoint_minutes: wall-clock time between checkpoints.
             cores: it keeps to these; none leaves them to the system.
-            workers: of a batch, the processes that step environments.
+            workers: of a run group, the processes that step environments.
             patience: seconds that it waits for a run folder that is in use.
         """
         runs = [{"config": run.cell.config.to_dict(), "folder": str(run.cell.folder.absolute())} for run in self.runs]
@@ -109,8 +101,6 @@ class Task:
 
         One that was told to stop before it could listen, while it was still importing, has lost nothing.
         """
-        last_lines = [line for line in errors.splitlines() if line.strip()][-ERROR_LINES:]
-        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
         for run in self.runs:
             if run.status != "running":
                 continue
@@ -120,7 +110,7 @@ class Task:
                 run.status = "interrupted"
             else:
                 run.status = "failed"
-                run.message = f"worker ended with {how}" + (f": {last_lines[-1]}" if last_lines else "")
+                run.message = f"its worker ended ({how_it_ended(code, errors)})"
 
 
 def make_statuses(cells: Sequence[Cell]) -> list[RunStatus]:
@@ -129,9 +119,9 @@ def make_statuses(cells: Sequence[Cell]) -> list[RunStatus]:
 
 
 def make_tasks(statuses: Sequence[RunStatus], batch: int) -> list[Task]:
-    """The unfinished runs, each alone, or up to `batch` of the same structure together; in the grid's order."""
+    """The unfinished runs, each alone, or up to `batch` of the same structure as one group; in the grid's order."""
     waiting = [status for status in statuses if status.status == "waiting"]
     if batch == 0:
         return [Task([status], 0) for status in waiting]
-    groups = batches([status.cell for status in waiting], batch)
+    groups = run_groups([status.cell for status in waiting], batch)
     return [Task([waiting[index] for index in group.members], group.slots) for group in groups]

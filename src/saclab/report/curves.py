@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saclab.report.runs import Arm, Comparison
+from saclab.report.arms import Arm
+from saclab.report.runs import Comparison
 from saclab.report.statistics import bootstrap_band
 from saclab.training.run_folder import RunRecord
 
@@ -35,11 +36,11 @@ class Quantity(NamedTuple):
 PAPER_PANELS = (
     Quantity("policy_loss", "policy loss", "metrics", "actor_loss", "updates",
              "α log π − Q of the policy's own actions (Eq. 5); about the negative of the critic's value"),
-    Quantity("training_reward", "training reward", "episodes", "return", "episodes",
+    Quantity("training_return", "training return", "episodes", "return", "episodes",
              "return of each training episode, with the policy's noise"),
-    Quantity("running_average", "training reward, running average", "episodes", "running_average", "episodes",
+    Quantity("running_average", "training return, running average", "episodes", "running_average", "episodes",
              "0.8 old + 0.2 new"),
-    Quantity("test_reward", "test reward", "evaluations", "mean_return", "episodes",
+    Quantity("evaluation_return", "evaluation return", "evaluations", "mean_return", "episodes",
              "mean return of the deterministic policy"),
 )  # fmt: skip
 """The panels of the paper's Figures 1 and 2."""
@@ -69,7 +70,7 @@ class Series(NamedTuple):
     """One quantity of one run; the arrays have equal lengths."""
 
     x: dict[str, np.ndarray]
-    """By key of AXES; hours for seconds."""
+    """Key of AXES -> values; hours for seconds."""
     y: np.ndarray
 
 
@@ -90,12 +91,12 @@ class ArmCurves(NamedTuple):
     """One quantity of one arm in one environment."""
 
     runs: dict[int, Series]
-    """By seed; without those that have no value yet."""
+    """Seed -> its curve, without those that have no value yet."""
     band: SeedBand
 
 
 Curves = dict[tuple[str, Arm, str], ArmCurves]
-"""By environment, arm and key of a quantity; missing where nothing was logged."""
+"""(environment, arm, key of a quantity) -> curves; missing where nothing was logged."""
 
 
 def gather_curves(comparison: Comparison) -> Curves:

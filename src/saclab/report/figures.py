@@ -17,15 +17,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from saclab.report.arms import Arm, by_paper_name
 from saclab.report.curves import AXES, DIAGNOSTICS, PAPER_PANELS, ArmCurves, Curves, Quantity, logged
+from saclab.report.notices import all_notices, notices
+from saclab.report.pairs import Pair
 from saclab.report.paper import paper_curves
-from saclab.report.runs import Arm, Comparison, all_notices, by_paper_name, notices, shown
-from saclab.report.scores import AggregateScores, EnvironmentScores, Pair, number_text
+from saclab.report.runs import Comparison
+from saclab.report.scores import AggregateScores, EnvironmentScores
 from saclab.report.statistics import Band, Interval
+from saclab.report.text import number_text, shown
 from saclab.training.run_folder import safe_name
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DOTS_PER_INCH = 150
+FEW_ARMS = 4  # so many can be told apart seed by seed
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 STYLE: Any = {
     "font.size": 9,
@@ -63,7 +68,7 @@ def write_figures(
                 "improvement": draw_pairs(entry.pairs, shown(entry.environment)),
                 "profiles": draw_profiles(
                     {arm.arm: arm.profile for arm in entry.arms if arm.profile},
-                    entry.thresholds, "final test return", shown(entry.environment), styles,
+                    entry.thresholds, "final evaluation return", shown(entry.environment), styles,
                 ),
             }  # fmt: skip
             for kind, figure in figures.items():
@@ -124,8 +129,8 @@ def draw_curves(
     for panel, quantity in zip(panels, quantities):
         for arm, index in styles.items():
             if of_arm := curves.get((environment, arm, quantity.key)):
-                handles |= draw_arm(panel, of_arm, arm, quantity.axis, index)
-        if quantity.key == "test_reward":
+                handles |= draw_arm(panel, of_arm, arm, quantity.axis, index, len(styles) > FEW_ARMS)
+        if quantity.key == "evaluation_return":
             handles |= draw_paper(panel, environment, by_paper_name(styles))
         panel.set_title(quantity.title, loc="left", fontsize=10)
         panel.set_xlabel(AXES[quantity.axis])
@@ -141,31 +146,31 @@ def draw_curves(
     return figure
 
 
-def draw_arm(panel: Any, curves: ArmCurves, arm: Arm, axis: str, index: int) -> dict[str, Any]:
-    """Draw one arm; returns its legend entry, with its number of seeds."""
-    colour, band = COLOURS[index % len(COLOURS)], curves.band
+def draw_arm(panel: Any, curves: ArmCurves, arm: Arm, axis: str, index: int, crowded: bool) -> dict[str, Any]:
+    """Draw one arm, its seeds and band fainter among many; returns its legend entry, with its number of seeds."""
+    colour, band, ink = COLOURS[index % len(COLOURS)], curves.band, 0.4 if crowded else 1.0
     if len(curves.runs) > 1:
         for curve in curves.runs.values():
-            panel.plot(curve.x[axis], curve.y, color=colour, linewidth=0.5, alpha=0.45)
-        panel.fill_between(band.x[axis], band.low, band.high, color=colour, alpha=0.18, linewidth=0)
+            panel.plot(curve.x[axis], curve.y, color=colour, linewidth=0.5, alpha=0.45 * ink)
+        panel.fill_between(band.x[axis], band.low, band.high, color=colour, alpha=0.18 * ink, linewidth=0)
     (line,) = panel.plot(band.x[axis], band.middle, **marker_style(index, len(band.middle)))
     return {wrapped(f"{arm.title}, {seeds_text(band.runs)}", 40): line}
 
 
 def draw_paper(panel: Any, environment: str, styles: dict[str, int]) -> dict[str, Any]:
-    """The paper's own test-reward curves, dashed, in the colour of the variant of that name."""
+    """The paper's own curves of evaluation returns, dashed, in the colour of the variant of that name."""
     handles = {}
     limit = panel.get_xlim()[1] if panel.lines else np.inf
     for name, curve in paper_curves(environment).items():
         colour = COLOURS[styles[name] % len(COLOURS)] if name in styles else "#777777"
-        x, y = curve.episode[curve.episode <= limit], curve.test_reward[curve.episode <= limit]
+        x, y = curve.episode[curve.episode <= limit], curve.evaluation_return[curve.episode <= limit]
         (line,) = panel.plot(x, y, color=colour, linewidth=1.1, linestyle="--")
         handles[f"paper: {name}, 1 seed, ±300"] = line
     return handles
 
 
-def wrapped(text: str, width: int = 32) -> str:
-    return "\n".join(textwrap.wrap(text, width, break_on_hyphens=False))
+def wrapped(text: str, width: int = 32, on_hyphens: bool = False) -> str:
+    return "\n".join(textwrap.wrap(text, width, break_on_hyphens=on_hyphens))
 
 
 def seeds_text(count: int) -> str:
@@ -185,13 +190,17 @@ def draw_interval(panel: Any, row: int, interval: Interval, index: int) -> None:
 
 
 def draw_scores(entry: EnvironmentScores, styles: dict[Arm, int]) -> Figure | None:
-    """Final, best and average test return of every arm: interquartile mean with its 95 % interval, and every run."""
+    """Final, best and mean evaluation return of every arm: interquartile mean with its 95 % interval, and every run."""
     arms = [arm for arm in entry.arms if arm.runs]
     if not arms:
         return None
     figure = new_figure(11, 1.6 + 0.55 * len(arms), shown(entry.environment))
     panels = figure.subplots(1, 3, sharey=True)
-    titles = {"final": "final test return", "best": "best test return (flatters)", "area": "mean over training"}
+    titles = {
+        "final": "final evaluation return",
+        "best": "best evaluation return (flatters)",
+        "area": "mean over training",
+    }
     for panel, (field, title) in zip(panels, titles.items()):
         for row, arm in enumerate(arms):
             draw_interval(panel, row, getattr(arm, field), styles[arm.arm])
@@ -242,7 +251,7 @@ def draw_pairs(pairs: Sequence[Pair], title: str) -> Figure | None:
                 fontweight="bold" if pair.improvement.decided else "normal",
             )
     panel.imshow(matrix, cmap=matplotlib.colormaps["PuOr"], vmin=-0.3, vmax=1.3)
-    names = [wrapped(arm.title, 19) for arm in arms]
+    names = [wrapped(arm.title, 19, on_hyphens=True) for arm in arms]
     panel.set_xticks(range(len(arms)), names)
     panel.set_yticks(range(len(arms)), names)
     panel.grid(False)
@@ -282,10 +291,10 @@ def draw_aggregate(aggregate: AggregateScores | None, styles: dict[Arm, int]) ->
     set_arm_rows(
         panel, [f"{wrapped(entry.arm.title)}\n{entry.interquartile_mean.runs} runs" for entry in aggregate.arms]
     )
-    panel.set_xlabel("interquartile mean of normalised final test returns")
+    panel.set_xlabel("interquartile mean of normalised final evaluation returns")
     profiles = {entry.arm: entry.profile for entry in aggregate.arms}
     return {
         "intervals": figure,
         "improvement": draw_pairs(aggregate.pairs, "All environments"),
-        "profiles": draw_profiles(profiles, aggregate.thresholds, "normalised final test return", title, styles),
+        "profiles": draw_profiles(profiles, aggregate.thresholds, "normalised final evaluation return", title, styles),
     }

@@ -14,18 +14,24 @@ from html import escape
 from importlib import resources
 from string import Template
 
+from saclab.report.arms import Arm, own_name
 from saclab.report.curves import Curves
 from saclab.report.page_data import page_data
+from saclab.report.pairs import Pair
 from saclab.report.paper import CURVE_ACCURACY, SOURCE
-from saclab.report.runs import Arm, Comparison, shown
-from saclab.report.scores import (
-    AggregateScores,
-    EnvironmentScores,
-    Pair,
-    aggregate_sentences,
-    environment_sentences,
+from saclab.report.runs import Comparison
+from saclab.report.scores import AggregateScores, EnvironmentScores
+from saclab.report.sentences import aggregate_sentences, environment_sentences
+from saclab.report.tables import (
+    Table,
+    arms_table,
+    differences_table,
+    runs_table,
+    scores_table,
+    settings_table,
+    versions_table,
 )
-from saclab.report.tables import Table, runs_table, scores_table, settings_table, versions_table
+from saclab.report.text import count_text, shown
 from saclab.report.train_command import train_command
 from saclab.training.run_folder import RunRecord
 
@@ -43,7 +49,7 @@ def make_page(
 ) -> str:
     """The whole page."""
     style, script = read_data("report.css"), read_data("report.js")
-    sections = [summary(scores, together)]
+    sections = [summary(comparison, scores, together)]
     sections += [environment_section(entry, number) for number, entry in enumerate(scores)]
     sections += [together_section(together), videos(comparison, scores), settings(comparison, scores)]
     return Template(read_data("report.html")).substitute(
@@ -74,23 +80,23 @@ def lead(comparison: Comparison) -> str:
     protocols = ", ".join(sorted({shown(run.config.protocol) for run in comparison.runs}))
     unfinished = sum(run.result is None for run in comparison.runs)
     state = f", {unfinished} of them unfinished" if unfinished else ""
+    arms = "arm" if any(arm.own_name for arm in comparison.arms) else "variant"
     return escape(
-        f"{count_text(len(comparison.runs), 'run')}{state}: {count_text(len(comparison.arms), 'variant')}, "
+        f"{count_text(len(comparison.runs), 'run')}{state}: {count_text(len(comparison.arms), arms)}, "
         f"{count_text(len(comparison.environments), 'environment')}, protocol {protocols}."
     )
 
 
-def count_text(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"
-
-
-def summary(scores: Sequence[EnvironmentScores], together: AggregateScores | None) -> str:
-    """The answer first: sentences for each environment."""
+def summary(comparison: Comparison, scores: Sequence[EnvironmentScores], together: AggregateScores | None) -> str:
+    """The answer first: sentences for each environment, and what the arms with a name of their own are."""
     parts = []
     for entry in scores:
         parts.append(f"<h3>{escape(shown(entry.environment))}</h3>{bullets(environment_sentences(entry))}")
     if together is not None:
         parts.append(f"<h3>All environments together</h3>{bullets(aggregate_sentences(together))}")
+    arms = arms_table(comparison)
+    if arms.rows:
+        parts.append(f"<h3>{escape(arms.title)}</h3>{table_html(arms, headed=True)}")
     return f'<section id="summary"><h2>Summary</h2>{"".join(parts)}</section>'
 
 
@@ -107,6 +113,7 @@ def environment_section(entry: EnvironmentScores, number: int) -> str:
 <h3>Learning curves</h3><div class="charts" data-environment="{number}" data-draw="curves"></div>
 <h3>Scores with intervals</h3><div class="charts" data-environment="{number}" data-draw="intervals"></div>
 {pairs_html(entry.pairs)}
+{differences_html(entry)}
 <h3>Share of runs above a score</h3><div class="charts" data-environment="{number}" data-draw="profile"></div>
 <h3>Diagnostics</h3><div class="charts" data-environment="{number}" data-draw="diagnostics"></div>
 </section>"""
@@ -116,8 +123,8 @@ def together_section(together: AggregateScores | None) -> str:
     if together is None:
         return ""
     return f"""<section id="together"><h2>All environments together</h2>
-<p>Final test returns, normalised by environment: 0 is the lowest and 1 the highest of any run there. Such numbers hold
-within this report only. The probability of improvement is the mean over environments.</p>
+<p>Final evaluation returns, normalised by environment: 0 is the lowest and 1 the highest of any run there. Such numbers
+hold within this report only. The probability of improvement is the mean over environments.</p>
 <div class="charts" data-environment="together" data-draw="intervals"></div>
 {pairs_html(together.pairs)}
 <h3>Share of runs above a score</h3><div class="charts" data-environment="together" data-draw="profile"></div>
@@ -163,7 +170,12 @@ def pairs_html(pairs: Sequence[Pair]) -> str:
     return f"""<h3>Probability that a run of the row ends higher than one of the column</h3>
 <div class="scroll" tabindex="0" role="region" aria-label="Probability of improvement"><table class="matrix">
 <thead><tr><td></td>{head}</tr></thead><tbody>{rows}</tbody></table></div>
-<p class="note">By final test return, with 95 % intervals; bold where the interval excludes ½ ({few}).</p>"""
+<p class="note">By final evaluation return, with 95 % intervals; bold where the interval excludes ½ ({few}).</p>"""
+
+
+def differences_html(entry: EnvironmentScores) -> str:
+    table = differences_table(entry)
+    return f"<h3>{escape(table.title)}</h3>{table_html(table, headed=True)}" if table.rows else ""
 
 
 def pair_cell(pair: Pair, flipped: bool) -> str:
@@ -199,7 +211,7 @@ def videos(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str:
 
 
 def best_recorded(runs: Sequence[RunRecord]) -> RunRecord | None:
-    """The run with the highest test return among those with a video."""
+    """The run with the highest evaluation return among those with a video."""
     recorded = [run for run in runs if (run.path / "best" / "video.mp4").is_file() and best_return(run) is not None]
     return max(recorded, key=lambda run: best_return(run) or 0.0, default=None)
 
@@ -211,7 +223,7 @@ def best_return(run: RunRecord) -> float | None:
 
 def video_html(environment: str, arm: Arm, run: RunRecord, size: int, embed: bool) -> str:
     caption = escape(
-        f"{arm.title} on {shown(environment)}, seed {run.config.seed}: the policy with the best test return, "
+        f"{arm.title} on {shown(environment)}, seed {run.config.seed}: the policy with the best evaluation return, "
         f"{best_return(run):,.0f}"
     )
     if not embed:
@@ -233,4 +245,4 @@ def settings(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str
 
 def commands(comparison: Comparison) -> str:
     """One line for each run."""
-    return escape("\n".join(shown(train_command(run.config), 2000) for run in comparison.runs))
+    return escape("\n".join(shown(train_command(run.config, own_name(run)), 2000) for run in comparison.runs))

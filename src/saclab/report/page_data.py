@@ -8,16 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from saclab.report.arms import Arm, by_paper_name
 from saclab.report.curves import AXES, DIAGNOSTICS, PAPER_PANELS, Curves, Quantity, logged
 from saclab.report.paper import STEPS_PER_EPISODE, UPDATES_PER_EPISODE, paper_curves
-from saclab.report.runs import Arm, Comparison, by_paper_name, shown
+from saclab.report.runs import Comparison
 from saclab.report.scores import AggregateScores, EnvironmentScores
 from saclab.report.statistics import Band, Interval
+from saclab.report.text import shown
 
 SCORE_PANELS = {
-    "final": "final test return",
-    "best": "best test return (flatters)",
-    "area": "mean test return over training",
+    "final": "final evaluation return",
+    "best": "best evaluation return (flatters)",
+    "area": "mean evaluation return over training",
 }
 
 
@@ -92,7 +94,7 @@ def environment_data(
             for field, title in SCORE_PANELS.items()
         ],
         "profile": profile_data(
-            "final test return", entry.thresholds, {arm.arm: arm.profile for arm in entry.arms if arm.profile}, places
+            SCORE_PANELS["final"], entry.thresholds, {arm.arm: arm.profile for arm in entry.arms if arm.profile}, places
         ),
     }  # fmt: skip
 
@@ -113,7 +115,7 @@ def panel_data(
         "title": quantity.title,
         "meaning": quantity.meaning,
         "arms": arms,
-        "paper": paper_data(environment, places, pool) if quantity.key == "test_reward" else [],
+        "paper": paper_data(environment, places, pool) if quantity.key == "evaluation_return" else [],
     }
 
 
@@ -126,7 +128,8 @@ def paper_data(environment: str, places: dict[Arm, int], pool: AxisPool) -> list
         if environment.startswith("HalfCheetah-"):
             x |= {"steps": curve.episode * STEPS_PER_EPISODE, "updates": curve.episode * UPDATES_PER_EPISODE}
         lines.append({
-            "title": f"paper: {name}", "arm": by_name.get(name), "x": pool.places_of(x), "y": numbers(curve.test_reward)
+            "title": f"paper: {name}", "arm": by_name.get(name), "x": pool.places_of(x),
+            "y": numbers(curve.evaluation_return),
         })  # fmt: skip
     return lines
 
@@ -157,7 +160,7 @@ def together_data(together: AggregateScores | None, places: dict[Arm, int]) -> d
     rows = [{**interval_data(entry.interquartile_mean), "arm": places[entry.arm], "runs": [], "paper": None}
             for entry in together.arms]  # fmt: skip
     profiles = {entry.arm: entry.profile for entry in together.arms}
-    title = "normalised final test return"
+    title = "normalised final evaluation return"
     return {
         "intervals": [{"title": title, "rows": rows}],
         "profile": profile_data(title, together.thresholds, profiles, places),

@@ -1,4 +1,4 @@
-"""What the paper "Soft Actor Critic and its variants" reports: its Table 2 and its test-reward curves.
+"""What the paper "Soft Actor Critic and its variants" reports: its Table 2 and its curves of evaluation returns.
 
 Each number is one training run (seed 44). The curves were read off the pictures of Figures 1(d) and 2(d) as medians
 over windows of 100 or 200 episodes, and are good to about ±300 at best, worse where curves overlap. The numbers named
@@ -21,13 +21,13 @@ AVERAGED_CAVEAT = (
 )
 UPDATES_PER_EPISODE = 200
 STEPS_PER_EPISODE = 1000
-"""Of an episode that is not cut short, as all of HalfCheetah's."""
+"""Length of an episode that is not cut short, as all of HalfCheetah's."""
 
 TABLE_2: dict[str, dict[str, float]] = {
     "HalfCheetah-v4": {"sac": 10182.9, "sac-alpha-tuning": 11348.2, "averaged-sac": 11141.6},
     "Humanoid-v4": {"sac": 5885.8, "sac-alpha-tuning": 6522.6, "averaged-sac": 7972.3},
 }
-"""Best test reward: environment -> `Variant.paper_name` -> mean return of 20 episodes."""
+"""Best evaluation return ("test reward"): environment -> `Variant.paper_name` -> mean return of 20 episodes."""
 
 
 class PaperCurve(NamedTuple):
@@ -35,12 +35,12 @@ class PaperCurve(NamedTuple):
 
     episode: np.ndarray
     """f64[n]: training episodes, increasing."""
-    test_reward: np.ndarray
-    """f64[n]: test reward, ±300 at best."""
+    evaluation_return: np.ndarray
+    """f64[n]: accurate to ±300 at best."""
 
 
 def paper_curves(environment: str) -> dict[str, PaperCurve]:
-    """`Variant.paper_name` -> the paper's test-reward curve; empty for an environment that is not in the paper."""
+    """`Variant.paper_name` -> the paper's curve; empty for an environment that is not in the paper."""
     text = (resources.files("saclab.report") / "data" / "paper_curves.csv").read_text(encoding="utf-8")
     points: dict[str, list[tuple[float, float]]] = {}
     for row in csv.DictReader(text.splitlines()):

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from saclab.report.curves import gather_curves
 from saclab.report.figures import write_figures
+from saclab.report.notices import all_notices
 from saclab.report.page import make_page
-from saclab.report.runs import all_notices, read_comparison
+from saclab.report.runs import read_comparison
 from saclab.report.scores import aggregate, score_environment
 from saclab.report.tables import latex, markdown, scores_csv
 
@@ -16,7 +17,7 @@ from saclab.report.tables import latex, markdown, scores_csv
 def write_report(runs: Sequence[Path], out: Path, allow_mixed: bool = False) -> Path:
     """Compare runs and write index.html, report.md, scores.csv, table.tex and figures/*.png, *.svg into `out`.
 
-    Runs may be unfinished, or have no test yet; the report says so.
+    Runs may be unfinished, or have no evaluation yet; the report says so.
 
     Args:
         runs: run folders.

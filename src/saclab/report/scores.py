@@ -1,19 +1,19 @@
-"""From the runs of an environment to scores, intervals, verdicts on pairs, and sentences."""
+"""From the runs of an environment to scores, intervals and pairs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from saclab.report.arms import Arm
+from saclab.report.notices import evaluations
+from saclab.report.pairs import MEASURES, Pair, Scores, compare_pairs
 from saclab.report.paper import TABLE_2
-from saclab.report.runs import Arm, Comparison, tests
+from saclab.report.runs import Comparison
 from saclab.report.statistics import (
-    FEW_RUNS,
     Band,
-    Improvement,
     Interval,
     area_under_curve,
     bootstrap_interval,
@@ -21,33 +21,29 @@ from saclab.report.statistics import (
     mean,
     median,
     normalise,
-    pair_sentence,
     performance_profile,
-    probability_of_improvement,
     steps_to_threshold,
 )
 from saclab.training.run_folder import RunRecord
 
 FINAL_SHARE = 0.1
-"""The final return is the mean over this last share of the tests, at least one: a single test is noisy."""
+"""The final return is the mean over this last share of the evaluations, at least one: a single one is noisy."""
 PROFILE_POINTS = 101
-MORE_SEEDS = "More seeds can change that: compare again with --seeds 5; finished runs are kept."
-ONE_SEED = f"One seed of each variant allows no conclusion about which is better. {MORE_SEEDS}"
 
 
 class RunScore(NamedTuple):
-    """What one run reached within the horizon of its environment; NaN without a test."""
+    """What one run reached within the horizon of its environment; NaN without an evaluation."""
 
     seed: int
     final: float
-    """Mean test return over the last tenth of the tests."""
+    """Mean return over the last tenth of the evaluations."""
     best: float
-    """Highest test return: a maximum over `tests` noisy numbers, so it flatters. The paper's Table 2 reports it."""
+    """Highest evaluation return: a maximum over `evaluations` noisy numbers, so it flatters. It is in Table 2."""
     area: float
-    """Mean test return over training: the area under the curve divided by its steps."""
+    """Mean evaluation return over training: the area under the curve divided by its steps."""
     steps_to_threshold: float
     """Infinite if the threshold was not reached."""
-    tests: int
+    evaluations: int
 
 
 class ArmScores(NamedTuple):
@@ -55,7 +51,7 @@ class ArmScores(NamedTuple):
 
     arm: Arm
     runs: tuple[RunScore, ...]
-    """Those with a test, in the order of their seeds."""
+    """Those with an evaluation, in the order of their seeds."""
     final: Interval
     """Interquartile means with 95 % intervals, here and below."""
     best: Interval
@@ -63,7 +59,7 @@ class ArmScores(NamedTuple):
     final_mean: Interval
     final_median: Interval
     steps_to_threshold: Interval
-    """Median."""
+    """Median over runs."""
     reached: int
     """Runs that reached the threshold."""
     paper_best: float | None
@@ -76,18 +72,9 @@ class ArmScores(NamedTuple):
         return np.array([getattr(run, field) for run in self.runs], np.float64)
 
     @property
-    def by_seed(self) -> dict[int, float]:
-        """Seed -> final return."""
-        return {run.seed: run.final for run in self.runs}
-
-
-class Pair(NamedTuple):
-    """Two arms compared by their final returns."""
-
-    x: Arm
-    y: Arm
-    improvement: Improvement
-    sentence: str
+    def by_seed(self) -> Scores:
+        """The scores that pairs are compared by."""
+        return {measure: {run.seed: getattr(run, measure) for run in self.runs} for measure in MEASURES}
 
 
 class EnvironmentScores(NamedTuple):
@@ -95,7 +82,7 @@ class EnvironmentScores(NamedTuple):
     horizon: float | None
     """Steps at which all runs were cut, since not all go further; None if nothing was cut."""
     threshold: float
-    """Test return for steps_to_threshold: the final return of the weakest arm, so that every arm gets there."""
+    """Evaluation return for steps_to_threshold: the final return of the weakest arm, so that every arm gets there."""
     arms: tuple[ArmScores, ...]
     pairs: tuple[Pair, ...]
     thresholds: np.ndarray
@@ -121,26 +108,26 @@ class AggregateScores(NamedTuple):
 
 
 def score_environment(comparison: Comparison, environment: str) -> EnvironmentScores:
-    """All scores of the runs in one environment that have at least one test."""
+    """All scores of the runs in one environment that have at least one evaluation."""
     horizon = common_horizon(comparison.runs_of(environment))
-    tested = {arm: [run for run in comparison.groups[environment, arm] if has_score(run)]
+    evaluated = {arm: [run for run in comparison.groups[environment, arm] if has_score(run)]
               for arm in comparison.arms_of(environment)}  # fmt: skip
-    finals = {arm: [score_run(run, horizon, np.inf).final for run in runs] for arm, runs in tested.items()}
+    finals = {arm: [score_run(run, horizon, np.inf).final for run in runs] for arm, runs in evaluated.items()}
     levels = [float(interquartile_mean(np.array(values))) for values in finals.values() if values]
     threshold = min(levels, default=np.nan)
     everything = np.array([value for values in finals.values() for value in values])
     thresholds = np.linspace(everything.min(), everything.max(), PROFILE_POINTS) if len(everything) else np.zeros(0)
     arms = tuple(
         score_arm(environment, arm, [score_run(run, horizon, threshold) for run in runs], thresholds)
-        for arm, runs in tested.items()
+        for arm, runs in evaluated.items()
     )
-    pairs = compare_pairs([{scores.arm: scores for scores in arms if scores.runs}])
+    pairs = compare_pairs([{scores.arm: scores.by_seed for scores in arms if scores.runs}])
     return EnvironmentScores(environment, horizon, threshold, arms, pairs, thresholds)
 
 
 def has_score(run: RunRecord) -> bool:
     """A run that diverged to returns that are not numbers has none."""
-    return tests(run) > 0 and bool(np.isfinite(run.evaluations["mean_return"]).all())
+    return evaluations(run) > 0 and bool(np.isfinite(run.evaluations["mean_return"]).all())
 
 
 def common_horizon(runs: Sequence[RunRecord]) -> float | None:
@@ -149,18 +136,18 @@ def common_horizon(runs: Sequence[RunRecord]) -> float | None:
     A finished run that stopped early by the protocol's own rule (patience, a limit on episodes) cuts nobody. An
     unfinished one does: leaving it out would flatter a variant whose bad runs break off.
     """
-    tested = [run for run in runs if has_score(run)]
+    evaluated = [run for run in runs if has_score(run)]
     budgets = {(run.config.training.max_steps, run.config.training.max_updates, run.config.training.max_episodes)
                for run in runs}  # fmt: skip
-    limiting = tested if len(budgets) > 1 else [run for run in tested if run.result is None]
+    limiting = evaluated if len(budgets) > 1 else [run for run in evaluated if run.result is None]
     if not limiting:
         return None
     shortest = min(float(run.evaluations["steps"][-1]) for run in limiting)
-    return shortest if any(run.evaluations["steps"][-1] > shortest for run in tested) else None
+    return shortest if any(run.evaluations["steps"][-1] > shortest for run in evaluated) else None
 
 
 def score_run(run: RunRecord, horizon: float | None, threshold: float) -> RunScore:
-    """Score a run with at least one test, on its tests up to `horizon` steps (its first test counts always)."""
+    """Score a run with at least one evaluation, on those up to `horizon` steps (its first one counts always)."""
     steps, returns = run.evaluations["steps"], run.evaluations["mean_return"]
     count = max(1, int(np.sum(steps <= horizon))) if horizon is not None else len(steps)
     steps, returns = steps[:count], returns[:count]
@@ -170,7 +157,7 @@ def score_run(run: RunRecord, horizon: float | None, threshold: float) -> RunSco
         best=float(np.max(returns)),
         area=area_under_curve(steps, returns),
         steps_to_threshold=steps_to_threshold(steps, returns, threshold),
-        tests=count,
+        evaluations=count,
     )
 
 
@@ -194,25 +181,6 @@ def score_arm(environment: str, arm: Arm, runs: Sequence[RunScore], thresholds: 
     )
 
 
-def compare_pairs(environments: Sequence[dict[Arm, ArmScores]]) -> tuple[Pair, ...]:
-    """Every pair of arms by final return, over environments that all have the arms of the first."""
-    pairs = []
-    for x, y in combinations(environments[0], 2):
-        improvement = probability_of_improvement(
-            [scores[x].values("final") for scores in environments],
-            [scores[y].values("final") for scores in environments],
-            [matched(scores[x], scores[y]) for scores in environments],
-        )
-        pairs.append(Pair(x, y, improvement, pair_sentence(x.name, y.name, improvement)))
-    return tuple(pairs)
-
-
-def matched(x: ArmScores, y: ArmScores) -> tuple[np.ndarray, np.ndarray]:
-    """Final returns f64[P] of each on the seeds that both have."""
-    seeds = sorted(x.by_seed.keys() & y.by_seed.keys())
-    return np.array([x.by_seed[seed] for seed in seeds]), np.array([y.by_seed[seed] for seed in seeds])
-
-
 def aggregate(environments: Sequence[EnvironmentScores]) -> AggregateScores | None:
     """All environments together; None for fewer than two, or if no arm has runs in all of them.
 
@@ -232,66 +200,5 @@ def aggregate(environments: Sequence[EnvironmentScores]) -> AggregateScores | No
                   for entry, scores in zip(complete, environments)]  # fmt: skip
         iqm, average, middle = (bootstrap_interval(strata, each) for each in (interquartile_mean, mean, median))
         arms.append(AggregateArm(arm, iqm, average, middle, performance_profile(strata, thresholds)))
-    pairs = compare_pairs([{arm: entry[arm] for arm in shared} for entry in complete])
+    pairs = compare_pairs([{arm: entry[arm].by_seed for arm in shared} for entry in complete])
     return AggregateScores(tuple(arms), pairs, thresholds)
-
-
-def environment_sentences(scores: EnvironmentScores) -> list[str]:
-    """The summary of an environment: first the verdicts, then the levels they rest on, then what to beware of."""
-    tested = [arm for arm in scores.arms if arm.runs]
-    if not tested:
-        return ["No run has a test so far, so there is nothing to compare."]
-    sentences = pair_sentences(scores.pairs)
-    fewest, most = min(len(arm.runs) for arm in tested), max(len(arm.runs) for arm in tested)
-    if most == 1:
-        levels = "; ".join(f"{arm.arm.name} {number_text(arm.final.estimate)}" for arm in tested)
-        sentences.append(f"Final test return (one seed, no interval): {levels}.")
-    else:
-        levels = "; ".join(f"{arm.arm.name} {interval_text(arm.final)}" for arm in tested)
-        sentences.append(f"Final test return: {levels}.")
-    if 1 < fewest < FEW_RUNS:
-        sentences.append(
-            f"With fewer than {FEW_RUNS} seeds the bootstrap intervals of returns are too narrow: read them as hints."
-        )
-    if scores.horizon is not None:
-        sentences.append(
-            f"All runs are scored up to {scores.horizon:,.0f} environment steps only, where the shortest one stands."
-        )
-    return sentences
-
-
-def aggregate_sentences(together: AggregateScores) -> list[str]:
-    """The summary of all environments together."""
-    levels = "; ".join(f"{entry.arm.name} {interval_text(entry.interquartile_mean)}" for entry in together.arms)
-    return [*pair_sentences(together.pairs), f"Normalised final test return: {levels.replace(' seeds', ' runs')}."]
-
-
-def pair_sentences(pairs: Sequence[Pair]) -> list[str]:
-    """Decided pairs first, then undecided ones; those that no interval exists for in one sentence."""
-    known = [pair for pair in pairs if pair.improvement.exists]
-    sentences = [pair.sentence for pair in sorted(known, key=lambda pair: not pair.improvement.decided)]
-    runs = {pair.x: pair.improvement.runs_x for pair in pairs} | {pair.y: pair.improvement.runs_y for pair in pairs}
-    alone = [arm.name for arm, count in runs.items() if count < 2]
-    if alone and len(alone) == len(runs):
-        return [ONE_SEED]
-    if alone:
-        sentences.append(f"With one seed only, nothing can be said about {', '.join(alone)}. {MORE_SEEDS}")
-    return sentences
-
-
-def interval_text(interval: Interval) -> str:
-    """An estimate, its interval and its number of runs in words."""
-    if interval.runs == 0:
-        return "no test yet"
-    seeds = f"{interval.runs} seed{'s' * (interval.runs != 1)}"
-    if not interval.exists:
-        return f"{number_text(interval.estimate)} (no interval: {seeds})"
-    return f"{number_text(interval.estimate)} [{number_text(interval.low)}, {number_text(interval.high)}], {seeds}"
-
-
-def number_text(value: float) -> str:
-    """Three or more significant digits; an infinity is a threshold that was not reached."""
-    if np.isinf(value):
-        return "not reached"
-    digits = 0 if abs(value) >= 1000 else 1 if abs(value) >= 10 else 2
-    return f"{value:,.{digits}f}".replace("-", "−")

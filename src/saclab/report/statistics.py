@@ -234,6 +234,23 @@ def paired_improvement(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Interv
     return Interval(share, float(max(0, centre - half)), float(min(1, centre + half)), count)
 
 
+def difference_of_means(x: np.ndarray, y: np.ndarray) -> Interval:
+    """Mean of f64[R] minus mean of f64[S], with Welch's 95 % interval; `runs` counts those of the smaller sample.
+
+    Welch, Biometrika 34 (1947): the variances need not be equal. With one run of either there is no interval.
+    """
+    fewest = min(len(x), len(y))
+    if fewest == 0:
+        return Interval(np.nan, np.nan, np.nan, 0)
+    estimate = float(np.mean(x) - np.mean(y))
+    if fewest < 2:
+        return Interval(estimate, np.nan, np.nan, fewest)
+    if np.var(x) == np.var(y) == 0:  # no spread at all: scipy divides by it
+        return Interval(estimate, estimate, estimate, fewest)
+    low, high = stats.ttest_ind(x, y, equal_var=False).confidence_interval(CONFIDENCE)
+    return Interval(estimate, float(low), float(high), fewest)
+
+
 def runs_needed(probability: float) -> float:
     """Runs of each variant that would show `probability` ≠ ½ with a power of 80 %; infinite at ½.
 
@@ -245,35 +262,14 @@ def runs_needed(probability: float) -> float:
     return float(np.ceil(z**2 / (6 * (probability - 0.5) ** 2)))
 
 
-def pair_sentence(x: str, y: str, improvement: Improvement) -> str:
-    """What the runs say about the variants named `x` and `y`, in one plain sentence."""
-    p, low, high, runs_x, runs_y, _ = improvement
-    same = runs_x == runs_y
-    seeds = f"{runs_x} seed{'s' * (runs_x != 1)}" if same else f"{runs_x} and {runs_y} seeds"
-    if np.isnan(low):
-        which = f"one seed of {x if runs_x < runs_y else y}" if not same else "one seed each"
-        return f"{x} and {y}: with {which} no interval exists, so nothing can be said about which is better."
-    if p < 0.5:
-        x, y, p, low, high = y, x, 1 - p, 1 - high, 1 - low
-        seeds = seeds if same else f"{runs_y} and {runs_x} seeds"
-    if low > 0.5:
-        return f"{x} beats {y}: P = {p:.2f} [{low:.2f}, {high:.2f}], {seeds}."
-    needed = max(runs_needed(p), max(runs_x, runs_y) + 1)
-    if needed > 1000:
-        outlook = "even a thousand would not"
-    else:
-        outlook = f"about {needed:.0f} would, if the difference is as it looks"
-    return f"{seeds} cannot tell {x} and {y} apart (P = {p:.2f} [{low:.2f}, {high:.2f}]); {outlook}."
-
-
 def area_under_curve(steps: np.ndarray, returns: np.ndarray) -> float:
-    """Area under f64[n] test returns, divided by the steps f64[n] they span: the mean test return during training."""
+    """Area under f64[n] evaluation returns, divided by the steps f64[n] they span: the mean return over training."""
     span = steps[-1] - steps[0]
     return float(np.trapezoid(returns, steps) / span) if span > 0 else float(np.mean(returns))
 
 
 def steps_to_threshold(steps: np.ndarray, returns: np.ndarray, threshold: float) -> float:
-    """Environment steps at the first test of at least `threshold`; infinite if there is none."""
+    """Environment steps at the first evaluation of at least `threshold`; infinite if there is none."""
     reached = returns >= threshold
     return float(steps[np.argmax(reached)]) if reached.any() else np.inf
 

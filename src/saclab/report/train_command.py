@@ -14,13 +14,19 @@ IDENTITY = ("environment", "variant", "protocol", "seed", "environment_arguments
 """What stands in the command anyway."""
 
 
-def train_command(config: Config) -> str:
+def train_command(config: Config, name: str | None = None) -> str:
     """`saclab train …` for this configuration, quoted for a shell; only what its defaults do not say is spelled out.
 
     For a variant or protocol that this version does not know, every setting is spelled out.
+
+    Args:
+        config: of the run.
+        name: takes the variant's place in the run folder's path.
     """
     words = ["saclab", "train", config.environment, "--variant", config.variant]
     words += ["--protocol", config.protocol, "--seed", str(config.seed)]
+    if name is not None:
+        words += ["--name", name]
     if config.environment_arguments:
         words += ["--environment-arguments", json.dumps(config.environment_arguments)]
     try:

@@ -1,4 +1,4 @@
-"""What each command takes, and which function it calls. No logic lives here.
+"""The commands that train, and what they call.
 
 Nothing slow is imported before a command runs, so that `saclab --help` answers at once.
 """
@@ -8,22 +8,26 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional, Suppress
+from tyro.conf import OmitArgPrefixes, Positional
 
-from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names
+from saclab.config import Config
 from saclab.errors import NonFiniteError, SettingError, TrainingFailed
-from saclab.protocols import PROTOCOLS
-from saclab.variants import VARIANTS
+from saclab.protocols import make_config
+from saclab.variants import COMPARED
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 EXIT_USER_ERROR = 2
 EXIT_FAILED = 1
+
+Given = Mapping[str, Any]
+"""The settings that were given, by name; `saclab.cli.settings` makes an option of each."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +46,8 @@ class Train:
 
     environment: Positional[str]
     """Gymnasium id, such as HalfCheetah-v4, or package.module:Name-v0 to import the package first."""
-    algorithm: OmitArgPrefixes[AlgorithmSettings]
-    training: OmitArgPrefixes[TrainingSettings]
+    algorithm: Given
+    training: Given
     variant: str = "sac-auto"
     """See `saclab variants`."""
     protocol: str = "standard"
@@ -51,7 +55,8 @@ class Train:
     seed: int = 0
     """Every random draw of the run derives from it."""
     name: str | None = None
-    """Takes the variant's place in the run folder's path, for runs with other settings."""
+    """Takes the variant's place in the run folder's path, for runs with other settings; the report shows them as an arm
+    of this name."""
     threads: int | None = None
     """Cores that XLA uses; None for all. Results depend on it in the last bits."""
     tensorboard: bool = False
@@ -64,9 +69,9 @@ class Train:
         limit_threads(self.threads)
         from saclab.training.run_folder import run_path
 
-        config = Config(
-            self.environment, self.variant, self.protocol, self.seed, self.algorithm, self.training,
-            parse_arguments(self.where.environment_arguments),
+        config = make_config(
+            self.environment, self.variant, self.protocol, self.seed,
+            parse_arguments(self.where.environment_arguments), {**self.algorithm, **self.training},
         )  # fmt: skip
         folder = run_path(self.where.runs, config, self.name)
         return train_and_show(config, folder, self.where.checkpoint_minutes, console, self.tensorboard, self.wandb)
@@ -106,9 +111,9 @@ class Compare:
 
     environments: Positional[tuple[str, ...]]
     """Gymnasium ids."""
-    algorithm: OmitArgPrefixes[AlgorithmSettings]
-    training: OmitArgPrefixes[TrainingSettings]
-    variants: tuple[str, ...] = ("sac", "sac-auto", "averaged", "averaged-auto")
+    algorithm: Given
+    training: Given
+    variants: tuple[str, ...] = COMPARED
     """See `saclab variants`."""
     protocol: str = "standard"
     """See `saclab protocols`."""
@@ -116,50 +121,46 @@ class Compare:
     """How many seeds, counted from first_seed; None for the protocol's own number."""
     first_seed: int = 0
     """The other seeds follow it."""
+    name: str | None = None
+    """Takes the variant's place in the run folders' paths, for one variant with other settings; the report shows them
+    as an arm of this name."""
     workers: int | None = None
-    """Runs at a time; of a batch, the processes that step its environments. None for one per core, or on Ray as many
-    tasks as the cluster has room for."""
+    """Runs at a time; of a run group, the processes that step its environments. None for one per core, or on Ray as
+    many tasks as the cluster has room for."""
     threads: int | None = None
-    """Cores that XLA uses for each run, or for a batch; None for one, or for all. Results depend on it in the last
+    """Cores that XLA uses for each run, or for a run group; None for one, or for all. Results depend on it in the last
     bits."""
     batch: int | None = None
-    """Runs of the same structure that are trained as one batch, their replay buffers on the device; 0 for each alone.
-    None for 16 on an accelerator, else 0. In a batch acting_delay is 1, unless it is given."""
+    """Runs of the same structure that are trained together, as one run group, their replay buffers on the device; 0 for
+    each alone, None for 16 on an accelerator, else 0. It changes no setting; --acting-delay 1 makes it faster."""
     launcher: Literal["local", "ray"] = "local"
     """Processes on this machine, or a Ray cluster whose machines share the runs' folder; needs the extra `ray`."""
     ray_address: str | None = None
-    """Of the cluster; None for RAY_ADDRESS, else the one that runs on this machine, else one that is started."""
+    """Where the cluster answers; None for RAY_ADDRESS, else the one on this machine, else one that is started."""
     ray_cpus: float | None = None
-    """Cores that Ray sets aside for each run, or for a batch; None for threads."""
+    """Cores that Ray sets aside for each run, or for a run group; None for threads."""
     ray_gpus: float = 0.0
-    """GPUs, or the part of one, that Ray sets aside for each run, or for a batch; 0 trains on cores."""
+    """GPUs, or the part of one, that Ray sets aside for each run, or for a run group; 0 trains on cores."""
     report: Path | None = None
     """Folder of the report; None for report in the runs' folder."""
     where: OmitArgPrefixes[Where] = field(default_factory=Where)
-    given: Suppress[frozenset[str]] = frozenset()
-    """Names of the settings that stand on the command line."""
 
     def __call__(self, console: Console) -> int:
         from saclab import api
         from saclab.cli import display
+        from saclab.grid.plan import seed_numbers
 
         if not self.environments:
             raise SettingError("environments", (), "name at least one, such as: saclab compare HalfCheetah-v4")
-        count = self.seeds if self.seeds is not None else PROTOCOLS[self.protocol].seeds
-        if count < 1:
-            raise SettingError("seeds", count, "use at least 1")
-        settings: tuple[Any, ...] = (self.algorithm, self.training)
-        overrides = {
-            name: getattr(part, name) for part in settings for name in field_names(type(part)) if name in self.given
-        }
         result = api.compare(
-            self.environments, self.variants, range(self.first_seed, self.first_seed + count), self.protocol,
-            workers=self.workers, threads=self.threads, batch=self.batch, runs=self.where.runs, report=self.report,
+            self.environments, self.variants, seed_numbers(self.seeds, self.protocol, self.first_seed), self.protocol,
+            workers=self.workers, threads=self.threads, batch=self.batch, runs=self.where.runs, name=self.name,
+            report=self.report,
             tell=lambda text: console.print(text, soft_wrap=True, highlight=False),
             environment_arguments=parse_arguments(self.where.environment_arguments),
             show=lambda stream: display.show_grid(stream, console),
             checkpoint_minutes=self.where.checkpoint_minutes, launcher=self.launcher, ray_address=self.ray_address,
-            ray_cpus=self.ray_cpus, ray_gpus=self.ray_gpus, **overrides,
+            ray_cpus=self.ray_cpus, ray_gpus=self.ray_gpus, **self.algorithm, **self.training,
         )  # fmt: skip
         return display.show_comparison(result, console)
 
@@ -170,16 +171,16 @@ class Reproduce:
 
     environments: tuple[str, ...] = ("HalfCheetah-v4", "Humanoid-v4")
     """Gymnasium ids."""
-    variants: tuple[str, ...] = ("sac", "sac-auto", "averaged", "averaged-auto")
+    variants: tuple[str, ...] = COMPARED
     """See `saclab variants`."""
     seeds: int | None = None
     """How many seeds; None for the protocol's own number."""
     updates: int | None = None
     """Fewer updates than the paper's; the report says that it is scaled down."""
     workers: int | None = None
-    """Runs at a time, one core each; of a batch, the processes that step its environments. None for one per core."""
+    """Runs at a time, one core each; of a run group, the processes that step its environments. None: one per core."""
     batch: int | None = None
-    """Runs of the same structure that are trained as one batch; 0 for each alone, None for 16 on an accelerator."""
+    """Runs of the same structure that are trained as one run group; 0 for each alone, None for 16 on an accelerator."""
     report: Path | None = None
     """Folder of the report; None for report in the runs' folder."""
     runs: Path = Path("runs")
@@ -198,102 +199,6 @@ class Reproduce:
             tell=lambda text: console.print(text, soft_wrap=True), checkpoint_minutes=self.checkpoint_minutes,
         )  # fmt: skip
         return display.show_comparison(result, console)
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Test a run's best policy on fresh episodes."""
-
-    run: Positional[Path]
-    """The run folder, or a folder that holds a policy."""
-    episodes: int = 20
-    """Test episodes, stepped side by side."""
-    seed: int = 1_000_000
-    """Of the episodes' starts; other than in training, where the policy was chosen."""
-    stochastic: bool = False
-    """Sample actions in place of the mean action."""
-    json: bool = False
-    """Print one line of JSON."""
-    imports: tuple[str, ...] = ()
-    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
-
-    def __call__(self, console: Console) -> int:
-        from saclab import playback
-
-        if self.episodes < 1:
-            raise SettingError("episodes", self.episodes, "use at least 1")
-        result = playback.evaluate(self.run, self.episodes, self.seed, not self.stochastic, self.imports)
-        console.print(json.dumps(result._asdict()) if self.json else result.sentence(), soft_wrap=True, highlight=False)
-        return 0
-
-
-@dataclass(frozen=True)
-class Record:
-    """Film a run's best policy; needs no screen."""
-
-    run: Positional[Path]
-    """The run folder."""
-    video: Path | None = None
-    """File to write; None for best/video.mp4 in the run folder, where the report finds it."""
-    steps: int = 300
-    """Environment steps to film at most."""
-    seed: int = 1_000_000
-    """Of the episode's start."""
-    size: int = 320
-    """Width and height in pixels."""
-    imports: tuple[str, ...] = ()
-    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
-
-    def __call__(self, console: Console) -> int:
-        from saclab import playback
-
-        path = self.video or self.run / "best" / "video.mp4"
-        told = playback.record(self.run, path, self.steps, self.seed, self.size, self.imports)
-        console.print(told, soft_wrap=True, markup=False)
-        return 0
-
-
-@dataclass(frozen=True)
-class Report:
-    """Write the comparison of finished and unfinished runs: a page, figures, tables."""
-
-    runs: Positional[tuple[Path, ...]]
-    """Run folders, or folders that hold some."""
-    out: Path = Path("report")
-    """Folder to write to."""
-    allow_mixed: bool = False
-    """Show runs that differ in more than variant and seed side by side, labelled by what differs, never pooled."""
-
-    def __call__(self, console: Console) -> int:
-        from saclab.report.report import write_report
-        from saclab.training.run_folder import find_runs
-
-        page = write_report(find_runs(self.runs or (Path("runs"),)), self.out, allow_mixed=self.allow_mixed)
-        console.print(f"report: {page.resolve()}", soft_wrap=True, markup=False)
-        return 0
-
-
-@dataclass(frozen=True)
-class Variants:
-    """List the variants of SAC."""
-
-    def __call__(self, console: Console) -> int:
-        from saclab.cli import display
-
-        console.print(display.catalogue({name: (row.description, row.settings) for name, row in VARIANTS.items()}))
-        return 0
-
-
-@dataclass(frozen=True)
-class Protocols:
-    """List the training protocols."""
-
-    def __call__(self, console: Console) -> int:
-        from saclab.cli import display
-
-        rows = {name: (row.description, display.changed_settings(row.settings)) for name, row in PROTOCOLS.items()}
-        console.print(display.catalogue(rows))
-        return 0
 
 
 def parse_arguments(text: str) -> dict[str, Any]:

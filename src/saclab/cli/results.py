@@ -1,0 +1,116 @@
+"""The commands that look at what has been trained: evaluate, record, report; and the lists of what there is.
+
+Nothing slow is imported before a command runs, so that `saclab --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from saclab.errors import SettingError
+from saclab.protocols import PROTOCOLS
+from saclab.variants import VARIANTS
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Evaluate a run's best policy on fresh episodes."""
+
+    run: Positional[Path]
+    """The run folder, or a folder that holds a policy."""
+    episodes: int = 20
+    """How many episodes, stepped side by side."""
+    seed: int = 1_000_000
+    """Seed of the episodes' starts, another than in training, where the policy was chosen."""
+    stochastic: bool = False
+    """Sample actions in place of the mean action."""
+    json: bool = False
+    """Print one line of JSON."""
+    imports: tuple[str, ...] = ()
+    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import playback
+
+        if self.episodes < 1:
+            raise SettingError("episodes", self.episodes, "use at least 1")
+        result = playback.evaluate(self.run, self.episodes, self.seed, not self.stochastic, self.imports)
+        console.print(json.dumps(result._asdict()) if self.json else result.sentence(), soft_wrap=True, highlight=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class Record:
+    """Film a run's best policy; needs no screen."""
+
+    run: Positional[Path]
+    """The run folder."""
+    video: Path | None = None
+    """File to write; None for best/video.mp4 in the run folder, where the report finds it."""
+    steps: int = 300
+    """Environment steps to film at most."""
+    seed: int = 1_000_000
+    """Seed of the episode's start."""
+    size: int = 320
+    """Width and height in pixels."""
+    imports: tuple[str, ...] = ()
+    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab import playback
+
+        path = self.video or self.run / "best" / "video.mp4"
+        told = playback.record(self.run, path, self.steps, self.seed, self.size, self.imports)
+        console.print(told, soft_wrap=True, markup=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write the comparison of finished and unfinished runs: a page, figures, tables."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Run folders, or folders that hold some."""
+    out: Path = Path("report")
+    """Folder to write to."""
+    allow_mixed: bool = False
+    """Show runs that differ in more than variant and seed side by side, labelled by what differs, never pooled."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.report.report import write_report
+        from saclab.training.run_folder import find_runs
+
+        page = write_report(find_runs(self.runs or (Path("runs"),)), self.out, allow_mixed=self.allow_mixed)
+        console.print(f"report: {page.resolve()}", soft_wrap=True, markup=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class Variants:
+    """List the variants of SAC."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.cli import display
+
+        console.print(display.catalogue({name: (row.description, row.settings) for name, row in VARIANTS.items()}))
+        return 0
+
+
+@dataclass(frozen=True)
+class Protocols:
+    """List the training protocols."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.cli import display
+
+        rows = {name: (row.description, display.changed_settings(row.settings)) for name, row in PROTOCOLS.items()}
+        console.print(display.catalogue(rows))
+        return 0

@@ -1,0 +1,73 @@
+"""The settings as options of the command line, of which only those come back that were given."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import inspect
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, TypedDict, get_type_hints
+
+from tyro.conf import OmitArgPrefixes, arg
+
+from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names
+from saclab.protocols import make_config
+
+HELP = ("-h", "--help")
+AN_ENVIRONMENT = re.compile(r"-v\d+$")
+
+
+def with_settings(command: type, arguments: Sequence[str]) -> Any:
+    """A command whose `algorithm` and `training` are dictionaries: tyro leaves out what was not given.
+
+    If help is asked for, it shows the values that the environment, variant and protocol on the line would have.
+    """
+    shown = named_config(arguments) if set(HELP) & set(arguments[1:]) else None
+    kinds = {"algorithm": AlgorithmSettings, "training": TrainingSettings}
+    bare: Any = OmitArgPrefixes
+    fields = [(name, bare[options_of(kind, getattr(shown, name, None))]) for name, kind in kinds.items()]
+    return dataclasses.make_dataclass(
+        command.__name__, fields, bases=(command,), namespace={"__doc__": command.__doc__}, frozen=True
+    )
+
+
+def named_config(arguments: Sequence[str]) -> Config:
+    """The configuration that a line names so far; raises UserError for an unknown name."""
+    line = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    line.add_argument("--variant", default="sac-auto")
+    line.add_argument("--protocol", default="standard")
+    named, _ = line.parse_known_args(arguments)
+    environment = next(filter(AN_ENVIRONMENT.search, arguments), "HalfCheetah-v4")
+    return make_config(environment, named.variant, named.protocol)
+
+
+def options_of(kind: type[AlgorithmSettings | TrainingSettings], shown: object) -> Any:
+    """A dictionary type with an option per setting: with its docstring and the value in `shown` if there is any."""
+    hints, told = get_type_hints(kind), docstrings(kind) if shown else {}
+    entries = {}
+    for name in field_names(kind):
+        option = arg(help=told.get(name, ""), help_behavior_hint=default_text(getattr(shown, name, None)))
+        entries[name] = Annotated[hints[name], option]
+    dictionary: Any = TypedDict
+    made = dictionary(kind.__name__, entries, total=False)
+    made.__doc__ = kind.__doc__
+    return made
+
+
+def default_text(value: object) -> str:
+    words = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return f"(default: {words})"
+
+
+def docstrings(kind: type) -> Mapping[str, str]:
+    """The docstring below each field of a dataclass, as one line."""
+    (definition,) = ast.parse(inspect.getsource(kind)).body
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for field, below in zip(definition.body, definition.body[1:]):
+        match field, below:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                found[name] = " ".join(text.split())
+    return found

@@ -1,0 +1,174 @@
+"""What is compared: a variant, or runs of one under a name of their own; and what runs must have in common."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+from saclab.config import Config, TrainingSettings
+from saclab.errors import UserError
+from saclab.protocols import PROTOCOLS, make_config, training_settings
+from saclab.report.text import shown
+from saclab.training.run_folder import RunRecord, safe_name
+from saclab.variants import VARIANTS
+
+SIMULATION_PACKAGES = ("gymnasium", "mujoco")
+"""Runs whose major versions of these differ are not comparable."""
+
+ONLY_MEASURING = ("q_bias_episodes",)
+"""Settings that change what is measured beside the training, and not its course."""
+
+
+class Arm(NamedTuple):
+    """A variant, or runs of one under a name of their own; where differing runs stand side by side, what differs."""
+
+    variant: str
+    own_name: str | None = None
+    """What stands in the variant's place in the run folders' paths, if it is something else."""
+    settings: tuple[tuple[str, str], ...] = ()
+    """Settings of the algorithm in which an arm with a name of its own differs from its variant."""
+    differs: tuple[tuple[str, str], ...] = ()
+    """What makes its runs not comparable with the others; they are shown on request only."""
+
+    @property
+    def name(self) -> str:
+        """A short name for sentences and tables."""
+        return shown(self.own_name or self.variant) + self.suffix
+
+    @property
+    def title(self) -> str:
+        """A name for figures: the variant's title, or the arm's own name."""
+        if self.own_name is not None or self.variant not in VARIANTS:
+            return self.name
+        return VARIANTS[self.variant].title + self.suffix
+
+    @property
+    def suffix(self) -> str:
+        """The first differences in brackets; empty if there is none."""
+        listed = [f"{name} {value}" for name, value in self.differs[:3]] + ["…"] * (len(self.differs) > 3)
+        return f" ({', '.join(listed)})" if listed else ""
+
+    @property
+    def settings_text(self) -> str:
+        """All settings in which it differs from its variant."""
+        return ", ".join(f"{name} {value}" for name, value in self.settings + self.differs)
+
+    @property
+    def paper_name(self) -> str | None:
+        """The system of the paper that it is; None if it has other settings."""
+        return VARIANTS[self.variant].paper_name if self.variant in VARIANTS and not self.settings else None
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """A key to sort arms by: in the order of VARIANTS, those with a name of their own behind their variant."""
+        known = list(VARIANTS)
+        place = known.index(self.variant) if self.variant in known else len(known)
+        return place, self.variant, self.own_name or "", self.settings, self.differs
+
+
+def by_paper_name(places: Mapping[Arm, int]) -> dict[str, int]:
+    """The paper's systems -> place of the first arm that is the same system."""
+    return {arm.paper_name: place for arm, place in reversed(list(places.items())) if arm.paper_name is not None}
+
+
+def own_name(run: RunRecord) -> str | None:
+    """What stands in the variant's place in the path of a run folder; None if it is the variant.
+
+    It is looked for only in a path as saclab makes it: <environment>/<name>/<protocol>/seed-<n>.
+    """
+    config, parts = run.config, run.path.absolute().parts
+    expected = (safe_name(config.environment), safe_name(config.protocol), f"seed-{config.seed}")
+    if len(parts) < 4 or (parts[-4], *parts[-2:]) != expected:
+        return None
+    return None if parts[-3] == safe_name(config.variant) else parts[-3]
+
+
+def conditions(run: RunRecord) -> dict[str, Any]:
+    """What must be equal for all runs of one environment: protocol, training and simulator."""
+    training = beside_own_training(run.config)
+    versions = {f"{package} version": major(run.versions.get(package)) for package in SIMULATION_PACKAGES}
+    return {
+        "protocol": run.config.protocol,
+        "update-to-data ratio": training.update_to_data_ratio,
+        **versions,
+        "environment_arguments": run.config.environment_arguments,
+        **{name: value for name, value in asdict(training).items() if name not in ONLY_MEASURING},
+    }
+
+
+def beside_own_training(config: Config) -> TrainingSettings:
+    """How a run is trained, but for what its variant's row says of it: there the protocol's values stand."""
+    row = VARIANTS[config.variant].settings if config.variant in VARIANTS else {}
+    values = asdict(config.training)
+    own = [name for name, value in row.items() if name in values and values[name] == value]
+    if not own or config.protocol not in PROTOCOLS:
+        return config.training
+    protocol = asdict(training_settings(config.protocol, config.environment))
+    return dataclasses.replace(config.training, **{name: protocol[name] for name in own})
+
+
+def beside_variant(config: Config) -> dict[str, Any]:
+    """Settings of the algorithm that are not the variant's own on this environment and protocol.
+
+    None for a variant or protocol that this version does not know: nothing tells which are its own.
+    """
+    try:
+        own = asdict(make_config(config.environment, config.variant, config.protocol).algorithm)
+    except UserError:
+        return {}
+    return {name: value for name, value in asdict(config.algorithm).items() if value != own[name]}
+
+
+def is_known(config: Config) -> bool:
+    """Whether this version knows which settings are the variant's own."""
+    return config.variant in VARIANTS and config.protocol in PROTOCOLS
+
+
+def major(version: str | None) -> str:
+    return re.split(r"[.+]", version)[0] if version else "unknown"
+
+
+def unlike(run: RunRecord, reference: RunRecord) -> dict[str, tuple[Any, Any]]:
+    """Name -> (value here, value there), for what makes two runs of one environment not comparable.
+
+    A run with a name of its own may have any settings of the algorithm; the others have their variant's, or those that
+    all have been given.
+    """
+    here, there = conditions(run), conditions(reference)
+    if own_name(run) is None:
+        here, there = here | beside_variant(run.config), there | beside_variant(reference.config)
+    own_here, own_there = asdict(run.config.algorithm), asdict(reference.config.algorithm)
+    return {
+        name: (
+            here[name] if name in here else f"the variant's own {own_here[name]}",
+            there[name] if name in there else f"the variant's own {own_there[name]}",
+        )
+        for name in here | there
+        if name not in here or name not in there or here[name] != there[name]
+    }
+
+
+def unlike_in_arm(run: RunRecord, first: RunRecord) -> dict[str, tuple[Any, Any]]:
+    """The same for the settings of the algorithm of two runs under one name, or of one variant that is not known."""
+    if own_name(run) is None and is_known(run.config):
+        return {}
+    here, there = asdict(run.config.algorithm), asdict(first.config.algorithm)
+    names = list(here)
+    if is_known(run.config):  # then the variant itself may have other values on another environment
+        names = sorted({*beside_variant(run.config), *beside_variant(first.config)})
+    return {name: (here[name], there[name]) for name in names if here[name] != there[name]}
+
+
+def arm_of(run: RunRecord, first: RunRecord, differences: Mapping[str, tuple[Any, Any]]) -> Arm:
+    """The arm of a run, given the first run of its name or variant, and what makes it not comparable."""
+    name = own_name(run)
+    settings = beside_variant(first.config) if name is not None else {}
+    return Arm(
+        run.config.variant,
+        name,
+        tuple((setting, shown(value, 30)) for setting, value in settings.items()),
+        tuple((shown(setting), shown(here, 30)) for setting, (here, _) in differences.items()),
+    )

@@ -1,0 +1,66 @@
+"""What every figure and table of some runs must say: scaled down, unfinished, without an evaluation yet."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from saclab.config import TrainingSettings
+from saclab.errors import UserError
+from saclab.protocols import training_settings
+from saclab.report.runs import Comparison
+from saclab.report.text import shown
+from saclab.training.run_folder import RunRecord
+
+
+def scale_notice(run: RunRecord) -> str | None:
+    """How far a run's settings fall short of its protocol; None if they do not. Quick always falls short."""
+    config = run.config
+    if config.protocol == "quick":
+        return "quick protocol, far shorter than the paper's: too short to judge a variant by"
+    try:
+        full = training_settings(config.protocol, config.environment)
+    except UserError:
+        return None
+    cuts = []
+    if most_updates(config.training) < most_updates(full):
+        cuts.append(f"{most_updates(config.training):,.0f} of {most_updates(full):,.0f} updates")
+    if (config.training.max_episodes or np.inf) < (full.max_episodes or np.inf):
+        cuts.append(f"at most {config.training.max_episodes:,} episodes")
+    return f"scaled down: {', '.join(cuts)} of the {config.protocol} protocol" if cuts else None
+
+
+def most_updates(settings: TrainingSettings) -> float:
+    """Updates that the limits on updates and steps allow; infinite if neither is set."""
+    by_steps = np.inf if settings.max_steps is None else settings.updates_due(settings.max_steps)
+    return min(by_steps, np.inf if settings.max_updates is None else settings.max_updates)
+
+
+def notices(runs: Sequence[RunRecord]) -> tuple[str, ...]:
+    """What every figure of these runs must say: scaled down, unfinished, without an evaluation yet."""
+    scaled = Counter(notice for run in runs if (notice := scale_notice(run)))
+    unfinished = sum(run.result is None for run in runs)
+    unevaluated = sum(evaluations(run) == 0 for run in runs)
+    sentences = [notice[0].upper() + notice[1:] for notice in scaled]
+    if unfinished:
+        sentences.append(f"{unfinished} of {len(runs)} runs unfinished")
+    if unevaluated:
+        sentences.append(f"{unevaluated} of {len(runs)} runs without an evaluation so far")
+    return tuple(sentences)
+
+
+def all_notices(comparison: Comparison) -> tuple[str, ...]:
+    """The notices of every environment, each with its name if there are several."""
+    several = len(comparison.environments) > 1
+    return tuple(
+        f"{shown(environment)}: {notice}" if several else notice
+        for environment in comparison.environments
+        for notice in notices(comparison.runs_of(environment))
+    )
+
+
+def evaluations(run: RunRecord) -> int:
+    """How many evaluations the run has made."""
+    return len(run.evaluations.get("mean_return", ()))

@@ -1,0 +1,53 @@
+"""What the command line makes of its words: the command, and the settings that were given and no others."""
+
+from __future__ import annotations
+
+import pytest
+
+from saclab.cli.main import parse
+from saclab.cli.settings import docstrings, named_config
+from saclab.config import AlgorithmSettings, TrainingSettings, field_names
+from saclab.errors import UserError
+
+
+def settings_of(*words: str) -> dict[str, object]:
+    command = parse(words)
+    return {**command.algorithm, **command.training}
+
+
+@pytest.mark.parametrize(
+    "environment", [("train", "--seed", "3", "Humanoid-v4"), ("train", "Humanoid-v4"), ("compare", "A-v0")]
+)
+def test_only_what_is_given_comes_back(environment):
+    assert settings_of(*environment) == {}
+    assert settings_of(*environment, "--discount", "0.98", "--max-steps=None") == {"discount": 0.98, "max_steps": None}
+    assert settings_of(*environment, "--hidden-layers", "512", "256", "--snapshots=1") == {
+        "hidden_layers": (512, 256), "snapshots": 1,
+    }  # fmt: skip
+    assert settings_of(*environment, "--target-entropy", "-3.5", "--temperature", "learned") == {
+        "target_entropy": -3.5, "temperature": "learned",
+    }  # fmt: skip
+    assert settings_of(*environment, "--batch_size", "7") == {"batch_size": 7}
+
+
+def test_the_environment_may_stand_anywhere_and_so_may_the_names():
+    command = parse(["train", "--seed", "3", "Humanoid-v4", "--protocol=paper", "--variant", "sac"])
+    assert (command.environment, command.seed, command.protocol, command.variant) == ("Humanoid-v4", 3, "paper", "sac")
+    assert parse(["compare", "A-v0", "B-v0", "--variants", "sac", "averaged"]).environments == ("A-v0", "B-v0")
+
+
+def test_help_shows_what_the_named_variant_and_protocol_have(capsys):
+    for words in (["train", "--seed", "3", "Humanoid-v4", "--variant=averaged"], ["compare", "--variant", "averaged"]):
+        with pytest.raises(SystemExit):
+            parse([*words, "--protocol", "quick", "--help"])
+        told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert "Transitions per update. (default: 64)" in told
+        assert "1 is plain SAC. (default: 10)" in told
+        assert f"or its first value if it is learned. (default: {0.1 if words[0] == 'train' else 0.2})" in told
+    with pytest.raises(UserError, match="did you mean 'averaged'"):
+        named_config(["train", "--variant", "averagd"])
+
+
+def test_every_setting_has_an_explanation():
+    for kind in (AlgorithmSettings, TrainingSettings):
+        assert set(docstrings(kind)) == set(field_names(kind))

@@ -1,0 +1,145 @@
+"""Runs of one variant with other settings of the algorithm, under a name of their own, are an arm of the comparison."""
+
+import csv
+
+import pytest
+
+from saclab.errors import UserError
+from saclab.report import figures
+from saclab.report.arms import own_name
+from saclab.report.report import write_report
+from saclab.report.runs import read_comparison
+from saclab.report.scores import score_environment
+from saclab.report.sentences import environment_sentences
+from saclab.training.run_folder import read_run
+from saclab.variants import VARIANTS, Variant
+
+from .synthetic import write_run
+
+SPACED = {"snapshot_interval": 200}
+SEVEN = {
+    "averaged": ("averaged", {}), "averaged-spacing-200": ("averaged", SPACED), "averaged-auto": ("averaged-auto", {}),
+    "sac": ("sac", {}), "sac-lag": ("sac", {"polyak_rate": 0.0009}), "averaged-entropy": ("averaged-entropy", {}),
+    "sac-auto": ("sac-auto", {}),
+}  # fmt: skip
+
+
+def spaced(root, seed=0, name="averaged-spacing-200", **more):
+    return write_run(root, "averaged", seed, name=name, overrides=SPACED, **more)
+
+
+def test_a_name_makes_other_settings_of_the_algorithm_an_arm(tmp_path):
+    runs = [write_run(tmp_path, variant, seed) for variant in ("sac", "averaged") for seed in (0, 1)]
+    runs += [spaced(tmp_path, seed) for seed in (0, 1)]
+    comparison = read_comparison(runs)
+    assert comparison.mixed == ()
+    assert [arm.name for arm in comparison.arms] == ["sac", "averaged", "averaged-spacing-200"]
+    assert [arm.settings_text for arm in comparison.arms] == ["", "", "snapshot_interval 200"]
+    assert [arm.paper_name for arm in comparison.arms] == ["sac", "averaged-sac", None]
+    assert [len(group) for group in comparison.groups.values()] == [2, 2, 2]
+
+
+def test_named_arms_are_compared_without_any_other_run(tmp_path):
+    runs = [spaced(tmp_path), write_run(tmp_path, "sac", name="sac-lag", overrides={"polyak_rate": 0.0009})]
+    assert [arm.name for arm in read_comparison(runs).arms] == ["sac-lag", "averaged-spacing-200"]
+
+
+def test_without_a_name_they_are_refused_with_the_way_out(tmp_path):
+    runs = [write_run(tmp_path, "averaged", 0), write_run(tmp_path / "other", "averaged", 1, overrides=SPACED)]
+    with pytest.raises(
+        UserError, match=r"snapshot_interval is 200 .*a name of their own \(--name\), report them apart"
+    ):
+        read_comparison(runs)
+
+
+@pytest.mark.parametrize("overrides", [{"update_interval": 1}, {"max_updates": 5}, {"replay_capacity": 50_000}])
+def test_a_name_does_not_excuse_another_training(tmp_path, overrides):
+    runs = [write_run(tmp_path, "averaged"), write_run(tmp_path, "averaged", name="mine", overrides=overrides)]
+    with pytest.raises(UserError, match=r"not comparable: (?!.*--name)"):
+        read_comparison(runs)
+
+
+@pytest.mark.parametrize("change", [{"versions": {"mujoco": "3.0"}}, {"protocol": "standard"}])
+def test_a_name_does_not_excuse_another_simulator_or_protocol(tmp_path, change):
+    with pytest.raises(UserError, match="not comparable"):
+        read_comparison([write_run(tmp_path, "averaged"), write_run(tmp_path, "averaged", name="mine", **change)])
+
+
+def test_one_name_has_the_same_settings_in_all_its_runs(tmp_path):
+    runs = [spaced(tmp_path, 0), write_run(tmp_path, "averaged", 1, name="averaged-spacing-200")]
+    with pytest.raises(UserError, match=r"snapshot_interval is 1 in .* and 200 in"):
+        read_comparison(runs)
+    elsewhere = write_run(tmp_path, "averaged", 0, "Humanoid-v4", name="averaged-spacing-200")
+    with pytest.raises(UserError, match=r"snapshot_interval is 1 in .* and 200 in"):
+        read_comparison([runs[0], elsewhere])
+
+
+def test_one_name_is_one_arm_on_all_environments(tmp_path):
+    runs = [write_run(tmp_path, "sac", 0, environment, name="sac-lag", overrides={"polyak_rate": 0.0009})
+            for environment in ("HalfCheetah-v4", "Humanoid-v4")]  # fmt: skip
+    (arm,) = read_comparison(runs).arms
+    assert arm.settings_text == "polyak_rate 0.0009"
+
+
+def test_the_same_run_under_two_names_is_no_second_run(tmp_path):
+    runs = [write_run(tmp_path, "averaged", 3), write_run(tmp_path, "averaged", 3, name="again")]
+    with pytest.raises(UserError, match="same experiment with the same seed 3"):
+        read_comparison(runs)
+
+
+def test_a_name_is_read_from_a_path_as_saclab_makes_it_only(tmp_path):
+    run = spaced(tmp_path)
+    assert own_name(read_run(run)) == "averaged-spacing-200"
+    assert own_name(read_run(write_run(tmp_path, "averaged"))) is None
+    moved = run.rename(tmp_path / "received")
+    assert own_name(read_run(moved)) is None
+
+
+def test_training_settings_of_a_variants_row_are_its_own(tmp_path, monkeypatch):
+    monkeypatch.setitem(VARIANTS, "fast", Variant("Fast", "", {"updates_per_interval": 20, "batch_size": 32}))
+    assert len(read_comparison([write_run(tmp_path, "sac"), write_run(tmp_path, "fast")]).arms) == 2
+    slower = write_run(tmp_path / "slower", "fast", 1, overrides={"updates_per_interval": 10})
+    with pytest.raises(UserError, match="update-to-data ratio is 2"):
+        read_comparison([write_run(tmp_path / "a", "sac"), write_run(tmp_path / "a", "sac", 1), slower])
+
+
+@pytest.fixture(scope="module")
+def seven(tmp_path_factory):
+    """Seven arms with five seeds each, two of them under names of their own, on the path of the averaging study."""
+    root = tmp_path_factory.mktemp("seven")
+    runs = [
+        write_run(root, variant, seed, name=name, overrides=overrides, evaluations=50, q_bias=True,
+                  level=8000 + 150 * index + 40 * seed)
+        for index, (name, (variant, overrides)) in enumerate(SEVEN.items()) for seed in range(5)
+    ]  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "DOTS_PER_INCH", 40)
+        return runs, write_report(runs, root / "out").parent
+
+
+def test_the_report_of_seven_arms_is_small_and_names_them(seven):
+    _, out = seven
+    page = (out / "index.html").read_text()
+    assert len(page) < 3e6
+    for text in (page, (out / "report.md").read_text().replace("\\_", "_")):
+        assert text.count("snapshot_interval 200") == 1, "what an arm is stands there once"
+        assert text.count("polyak_rate 0.0009") == 1
+    assert "--name averaged-spacing-200" in page, "its command puts it where it was"
+    assert "35 runs: 7 arms" in page
+    rows = list(csv.DictReader((out / "scores.csv").open()))
+    assert {row["name"] for row in rows} == set(SEVEN)
+    assert {row["differs"] for row in rows if row["name"] == "sac-lag"} == {"polyak_rate 0.0009"}
+
+
+def test_many_arms_are_ranked_and_undecided_pairs_take_one_sentence(seven):
+    entry = score_environment(read_comparison(seven[0]), "HalfCheetah-v4")
+    assert len(entry.pairs) == 21
+    *verdicts, undecided, levels = environment_sentences(entry)
+    count = sum(not pair.improvement.decided for pair in entry.pairs)
+    assert len(verdicts) == 21 - count > 0
+    assert all(" beats " in verdict for verdict in verdicts)
+    assert undecided.startswith(
+        f"{count} of the 21 pairs cannot be told apart with these seeds; the nearest to a verdict is "
+    )
+    best = max(entry.arms, key=lambda arm: arm.final.estimate).arm.name
+    assert levels.startswith(f"Final evaluation return (highest first): {best} ")

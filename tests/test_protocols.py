@@ -1,0 +1,62 @@
+"""Where a setting of a run comes from: defaults < protocol < variant < what the user says."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from saclab.errors import UserError
+from saclab.protocols import PROTOCOLS, make_config
+from saclab.variants import COMPARED, VARIANTS, Variant, variant_settings
+
+
+@pytest.fixture
+def row(monkeypatch):
+    """`row(batch_size=8)`: a variant named "mine" that differs from plain SAC in these settings."""
+    return lambda **settings: monkeypatch.setitem(VARIANTS, "mine", Variant("Mine", "", settings))
+
+
+def test_a_variant_keeps_its_own_settings_under_every_protocol(row):
+    row(batch_size=512, critic_learning_rate=1e-4)
+    for protocol in PROTOCOLS:
+        algorithm = make_config("HalfCheetah-v4", "mine", protocol).algorithm
+        assert (algorithm.batch_size, algorithm.critic_learning_rate) == (512, 1e-4)
+    assert make_config("HalfCheetah-v4", "mine", "quick").algorithm.actor_learning_rate == 1e-3
+
+
+def test_a_variant_may_set_how_a_run_is_trained(row):
+    row(updates_per_interval=20, update_interval=1, random_steps=5000)
+    training = make_config("Humanoid-v4", "mine", "paper").training
+    assert (training.update_to_data_ratio, training.random_steps) == (20, 5000)
+    assert training.patience_episodes == 750
+    assert variant_settings("mine", "Humanoid-v4") == variant_settings("sac", "Humanoid-v4")
+
+
+def test_what_the_user_says_counts_for_more_than_the_variant(row):
+    row(batch_size=512, random_steps=5000, snapshots=3)
+    config = make_config("HalfCheetah-v4", "mine", "quick", overrides={"batch_size": 16, "random_steps": 99})
+    assert (config.algorithm.batch_size, config.training.random_steps) == (16, 99)
+    assert config.algorithm.snapshots == 3
+
+
+def test_the_temperature_of_an_environment_counts_for_least(row, monkeypatch):
+    row(initial_temperature=0.7)
+    assert make_config("Humanoid-v4", "sac").algorithm.initial_temperature == 0.1
+    assert make_config("Humanoid-v4", "mine").algorithm.initial_temperature == 0.7
+    warm = dataclasses.replace(PROTOCOLS["quick"], algorithm={"initial_temperature": 0.5})
+    monkeypatch.setitem(PROTOCOLS, "quick", warm)
+    assert make_config("Humanoid-v4", "sac", "quick").algorithm.initial_temperature == 0.5
+    assert make_config("Humanoid-v4", "mine", "quick").algorithm.initial_temperature == 0.7
+
+
+def test_a_setting_that_does_not_exist_is_refused_wherever_it_stands(row):
+    row(batch_sise=3)
+    with pytest.raises(UserError, match="did you mean 'batch_size'"):
+        make_config("HalfCheetah-v4", "mine")
+    with pytest.raises(UserError, match="did you mean 'discount'"):
+        make_config("HalfCheetah-v4", "sac", overrides={"discout": 0.9})
+
+
+def test_the_variants_of_a_comparison_exist():
+    assert set(COMPARED) < set(VARIANTS)

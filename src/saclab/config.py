@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from saclab.errors import SettingError, unknown_name
+from saclab.errors import SettingError, UserError, unknown_name
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -253,3 +253,35 @@ def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settin
         if name not in known:
             raise unknown_name("setting", name, known)
     return dataclasses.replace(settings, **overrides)
+
+
+OWN_SETTINGS = (
+    "seed", "variant", "protocol",
+    "discount", "critic_learning_rate", "actor_learning_rate", "polyak_rate", "snapshot_interval", "temperature",
+    "initial_temperature", "temperature_learning_rate", "target_entropy", "log_std_minimum", "log_std_maximum",
+    "max_steps", "max_episodes", "patience_episodes", "evaluation_interval_episodes", "evaluation_interval_steps",
+    "evaluation_episodes", "q_bias_episodes", "log_interval",
+)  # fmt: skip
+"""Settings in which the runs of a group may differ: plain numbers, and those that decide nothing of a step."""
+
+
+def structure(config: Config) -> str:
+    """What the runs of a group have in common: everything but the seed, plain numbers and when a run is evaluated."""
+    return json.dumps(common_settings(config), sort_keys=True)
+
+
+def common_settings(config: Config) -> dict[str, Any]:
+    """The settings that decide a run's `structure`, by name."""
+    return {name: value for name, value in flatten(config.to_dict()).items() if name not in OWN_SETTINGS}
+
+
+def require_same_structure(configs: Sequence[Config]) -> None:
+    """Refuse runs that cannot be one group: raises UserError with the first setting that differs."""
+    expected = common_settings(configs[0])
+    for place, config in enumerate(configs[1:], start=1):
+        for name, value in common_settings(config).items():
+            if value != expected[name]:
+                raise UserError(
+                    f"the runs of one group must agree in {name}, and it is {expected[name]!r} in the first and "
+                    f"{value!r} in number {place + 1}: train them in groups of their own, or each alone (--batch 0)"
+                )

@@ -242,6 +242,24 @@ def test_replay_buffers_that_do_not_fit_are_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"activation": "tanh"}, "activation, and it is 'relu' in the first and 'tanh' in number 3"),
+        ({"hidden_layers": (16, 8)}, "hidden_layers"),
+        ({"snapshots": 2}, "snapshots"),
+        ({"parallel_environments": 2}, "parallel_environments"),
+        ({"max_updates": 17}, "max_updates"),
+        ({"environment": "MountainCarContinuous-v0"}, "environment"),
+    ],
+)
+def test_runs_of_different_structure_are_refused_before_anything_is_written(tmp_path, changes, named):
+    """Otherwise the first one's setting would be used for all of them, in silence."""
+    with pytest.raises(UserError, match=rf"must agree in {named}"):
+        train(tmp_path, [config(seed=0), config(seed=1, discount=0.5), config(seed=2, **changes)])
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_in_use_is_refused(tmp_path):
     configs = mixed()
     with closing(train_batch(configs, folders(tmp_path, configs), workers=1)) as first:

@@ -10,8 +10,9 @@ from resume.helpers import assert_same_run
 
 import saclab
 from saclab import api
+from saclab.config import structure
 from saclab.errors import SettingError
-from saclab.grid.groups import batches, structure
+from saclab.grid.groups import batches
 from saclab.grid.launch import launch
 from saclab.grid.plan import Cell, make_grid
 from saclab.training.requests import Requests

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from saclab.batch.batch import Batch
 from saclab.batch.member import Member
-from saclab.config import Config
+from saclab.config import Config, require_same_structure
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
 from saclab.machine import machine_facts, usable_cores
 from saclab.replay import ReplayBuffer
@@ -39,7 +39,7 @@ def train_batch(
     A run that finishes, or that meets a number that is not finite, leaves the others as they are.
 
     Args:
-        configs: what to train; `comparison.batches` says what the runs of a batch have in common.
+        configs: what to train; `config.structure` says what they must have in common.
         folders: the run folders; made if they do not exist.
         requests: asks the batch to stop or save.
         checkpoint_minutes: wall-clock time between checkpoints; it does not change the result.
@@ -50,9 +50,10 @@ def train_batch(
         The place of a run in `configs`, and what it tells.
 
     Raises:
-        UserError: if a folder holds another configuration, or is in use by another process.
+        UserError: if the runs do not have the same structure, or a folder holds another configuration or is in use.
         TrainingFailed: if no checkpoint can be written or read, or a process that steps environments has died.
     """
+    require_same_structure(configs)
     unfinished = []
     for index, (config, folder) in enumerate(zip(configs, folders, strict=True)):
         if is_finished(folder):

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from saclab.algorithm.numbers import Numbers
-from saclab.config import Config
+from saclab.config import structure
 from saclab.grid.plan import Cell
 from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
 from saclab.training.run_folder import FAILURE
 
-FREE = (
-    "max_steps", "max_episodes", "patience_episodes", "evaluation_interval_episodes",
-    "evaluation_interval_steps", "evaluation_episodes", "q_bias_episodes", "log_interval",
-)  # fmt: skip
-"""Settings of training in which the runs of a batch may differ: they decide nothing of a step."""
 NO_CHECKPOINT = -1  # in place of a step: one of step 0 is something else
 
 
@@ -28,17 +20,6 @@ class Group(NamedTuple):
     """Their places in the sequence that was given."""
     slots: int
     """Of the batch: as many as runs, or as the batch had from which they are continued."""
-
-
-def structure(config: Config) -> str:
-    """What the runs of a batch have in common: everything but the seed, plain numbers and when a run is tested."""
-    algorithm = {
-        name: value
-        for name, value in dataclasses.asdict(config.algorithm).items()
-        if name not in (*Numbers._fields, "temperature", "initial_temperature")
-    }
-    training = {name: value for name, value in dataclasses.asdict(config.training).items() if name not in FREE}
-    return json.dumps([config.environment, config.environment_arguments, algorithm, training], sort_keys=True)
 
 
 def batches(cells: Sequence[Cell], size: int) -> list[Group]:

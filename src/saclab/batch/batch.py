@@ -161,11 +161,9 @@ class Batch:
         jobs = []
         for member in wanted:
             learner = member.learner()
-            header = {
-                "do": "q_bias", "run": member.slot, "evaluations": member.counters.evaluations,
-                "alpha": float(np.exp(learner.log_alpha)),
-            }  # fmt: skip
-            jobs.append((header, {"actor": np.asarray(learner.actor), "critic": np.asarray(learner.critic)}))
+            header = {"do": "q_bias", "run": member.slot, "evaluations": member.counters.evaluations}
+            judged = {"actor": learner.actor, "critic": learner.critic, "log_alpha": learner.log_alpha}
+            jobs.append((header, {name: np.asarray(array) for name, array in judged.items()}))
         replies = self.pool.work_off(jobs, lambda: False)
         return {
             member.slot: QBias(*reply["bias"]) if "bias" in reply else error_of(reply["failure"], {})

@@ -20,10 +20,9 @@ from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import NonFiniteError, UserError
 from saclab.replay import RowLayout
-from saclab.training import seeds
 from saclab.training.captured import join_arrays, split_arrays
 from saclab.training.evaluation import Evaluator
-from saclab.training.q_bias import Critics, measure_q_bias
+from saclab.training.q_bias import critics_of, q_bias_at
 from saclab.training.requests import Stopped
 
 STEP, MESSAGE, DONE = b"s", b"m", b"."
@@ -115,18 +114,10 @@ class EnvironmentWorker:
 
     def q_bias(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """As `Run.q_bias`."""
-        config, number = self.configs[header["run"]], header["evaluations"]
-        learner = self._learner(header["run"])
-        critics = Critics(
-            learner.policy, arrays["actor"], learner.q_network, arrays["critic"], header["alpha"],
-            config.algorithm.discount,
-        )  # fmt: skip
+        config, learner = self.configs[header["run"]], self._learner(header["run"])
+        critics = critics_of(config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"])
         try:
-            bias = measure_q_bias(
-                critics, self.evaluator.environments[0], self.spec,
-                seeds.integers(config.seed, "q_bias", config.training.q_bias_episodes, number),
-                seeds.generator(config.seed, "q_bias", number),
-            )  # fmt: skip
+            bias = q_bias_at(config, critics, self.evaluator.environments[0], self.spec, header["evaluations"])
         except Exception as error:
             return {"failure": described(error)}, {}
         return {"bias": list(bias)}, {}

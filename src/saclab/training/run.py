@@ -19,7 +19,7 @@ from saclab.replay import ReplayBuffer, RowLayout, require_memory
 from saclab.training import seeds
 from saclab.training.course import Course
 from saclab.training.evaluation import EvaluationEpisodes, Evaluator
-from saclab.training.q_bias import Critics, QBias, measure_q_bias
+from saclab.training.q_bias import QBias, critics_of, q_bias_at
 from saclab.training.requests import Stopped
 
 
@@ -43,7 +43,7 @@ class Run(Course):
         self.evaluator = Evaluator(config.environment, config.environment_arguments)
 
         learner = make_learner(algorithm, self.spec.observation_size, self.spec.action_size)
-        self.policy, self.q_network = learner.policy, learner.q_network
+        self.judged, self.policy = learner, learner.policy
         self.learner_state: LearnerState = compiled_init(algorithm, layout)(seeds.learner_key(config.seed))
         self.update = compiled_update(algorithm, layout)
         self._actor: np.ndarray | None = None
@@ -111,15 +111,9 @@ class Run(Course):
         count, number = self.config.training.q_bias_episodes, self.counters.evaluations
         if count == 0:
             return None
-        critics = Critics(
-            self.policy, self.actor, self.q_network, np.array(self.learner_state.critic),
-            float(np.exp(np.asarray(self.learner_state.log_alpha))), self.config.algorithm.discount,
-        )  # fmt: skip
-        return measure_q_bias(
-            critics, self.evaluator.environments[0], self.spec,
-            seeds.integers(self.config.seed, "q_bias", count, number),
-            seeds.generator(self.config.seed, "q_bias", number),
-        )  # fmt: skip
+        state = self.learner_state
+        critics = critics_of(self.config, self.judged, self.actor, np.array(state.critic), np.asarray(state.log_alpha))
+        return q_bias_at(self.config, critics, self.evaluator.environments[0], self.spec, number)
 
     @property
     def observation(self) -> np.ndarray:

@@ -201,7 +201,7 @@ def chosen_batch(batch: int | None, launcher: str = "local", ray_gpus: float = 0
 def batch_note(cells: Sequence[Cell], batch: int) -> str:
     """What a user should know of a grid that is trained in batches."""
     from saclab.grid.groups import batches
-    from saclab.training.journal import ratio_note
+    from saclab.training.starts import ratio_note
 
     unfinished = [cell for cell in cells if not cell.finished]
     groups = batches(unfinished, batch)
@@ -296,7 +296,7 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
     """
     from saclab.environments.make import environment_spec, make_environment
     from saclab.replay import RowLayout, require_memory
-    from saclab.training.journal import require_same_config
+    from saclab.training.starts import require_same_config
 
     checked = set()
     for cell in cells:

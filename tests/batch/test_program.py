@@ -1,4 +1,4 @@
-"""What a batch computes is what each of its runs would compute alone."""
+"""What a run group computes is what each of its runs would compute alone."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from saclab.algorithm.numbers import numbers_of
-from saclab.batch.batch import number_arrays
-from saclab.batch.member import alone, init_settings, of_batch
-from saclab.batch.program import Arrival, Program
+from saclab.batch.program import Program, StepInputs, numbers_for
 from saclab.replay import RowLayout
 from saclab.training import seeds
-from saclab.training.course import named_leaves
-from saclab.training.run import compiled_init, compiled_update
+from saclab.training.learners import alone, compiled_init, compiled_update, init_settings, named_leaves, of_batch
 
 from .helpers import config, mixed
 
@@ -38,12 +35,12 @@ def test_each_slot_is_updated_by_its_own_numbers(snapshots):
     drawn = random.integers(0, CAPACITY, (len(settings), 5, 16), np.int32)
 
     program = Program(settings[0], LAYOUT, environments=2, slots=len(settings))
-    numbers = stacked([number_arrays(numbers_of(each, 2)) for each in settings])
+    numbers = stacked([numbers_for(each, 2) for each in settings])
     newest = rows[:, [CAPACITY - 1, 0]]  # two environments: the second row wraps around
     before = rows.copy()
     before[:, [CAPACITY - 1, 0]] = 0
     position = np.full(len(settings), CAPACITY - 1, np.int32)
-    packed = program.arrival(5).pack(len(settings), rows=newest, position=position, drawn=drawn)
+    packed = program.inputs(5).pack(len(settings), rows=newest, position=position, drawn=drawn)
     state, replay, metrics = program.advance(
         5, numbers, program.put(stacked([of_batch(each) for each in states])), program.put(before), program.put(packed)
     )
@@ -64,11 +61,11 @@ def test_actions_are_those_of_each_runs_policy():
     configs = mixed()
     states = [compiled_init(each.algorithm, LAYOUT)(seeds.learner_key(each.seed)) for each in configs]
     program = Program(configs[0].algorithm, LAYOUT, environments=4, slots=3)
-    numbers = stacked([number_arrays(numbers_of(each.algorithm, 2)) for each in configs])
+    numbers = stacked([numbers_for(each.algorithm, 2) for each in configs])
     random = np.random.default_rng(1)
     observation = random.standard_normal((3, 4, 3)).astype(np.float32)
     noise = random.standard_normal((3, 4, 2)).astype(np.float32)
-    packed = program.arrival(1).pack(3, observation=observation, noise=noise)
+    packed = program.inputs(1).pack(3, observation=observation, noise=noise)
     action = program.act(numbers, stacked([each.actor for each in states]), packed)
     policy = program._learner(numbers_of(configs[0].algorithm, 2)).policy
     for run, state in enumerate(states):
@@ -76,9 +73,9 @@ def test_actions_are_those_of_each_runs_policy():
         np.testing.assert_allclose(action[run], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_what_arrives_is_taken_apart_bit_for_bit():
+def test_the_inputs_of_a_step_are_taken_apart_bit_for_bit():
     """Also numbers that are no normal floating-point numbers, and whole numbers, whose bits are tiny ones."""
-    arrival = Arrival(LAYOUT, environments=2, updates=3, batch_size=4)
+    inputs = StepInputs(LAYOUT, environments=2, updates=3, batch_size=4)
     parts = {
         "observation": np.array([[[np.nan, -0.0, 1e-42], [1, 2, 3]]], np.float32),
         "noise": np.arange(4, dtype=np.float32).reshape(1, 2, 2),
@@ -86,11 +83,11 @@ def test_what_arrives_is_taken_apart_bit_for_bit():
         "position": np.array([7], np.int32),
         "drawn": np.arange(12, dtype=np.int32).reshape(1, 3, 4),
     }
-    packed = arrival.pack(2, **parts)
+    packed = inputs.pack(2, **parts)
     assert packed.shape == (2, 6 + 4 + 2 * LAYOUT.width + 1 + 12)
     assert (packed[1] == 0).all()
     for name, part in parts.items():
-        found = np.asarray(jax.jit(lambda slot, name=name: arrival.unpack(slot, name))(jnp.asarray(packed[0])))
+        found = np.asarray(jax.jit(lambda slot, name=name: inputs.unpack(slot, name))(jnp.asarray(packed[0])))
         assert found.dtype == part.dtype
         assert found.tobytes() == part[0].tobytes(), name
 

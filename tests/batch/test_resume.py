@@ -1,4 +1,4 @@
-"""A batch that was stopped, killed or broken off at any moment goes on as if nothing had been."""
+"""A run group that was stopped, killed or broken off at any moment goes on as if nothing had been."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import closing
 import pytest
 from resume.helpers import assert_same_run
 
-from saclab.batch.batch import Batch
+from saclab.batch.engine import DeviceEngine
 from saclab.batch.loop import train_batch
 from saclab.batch.pool import EnvironmentWorkerDied
 from saclab.training import loop
@@ -46,19 +46,19 @@ def test_saving_changes_nothing(tmp_path):
     assert_same_run(tmp_path / "straight/run-2", tmp_path / "saved/run-2")
 
 
-def test_a_stop_in_the_middle_of_a_test_leaves_the_test_to_be_made(tmp_path):
+def test_a_stop_in_the_middle_of_an_evaluation_leaves_it_to_be_made(tmp_path):
     configs = mixed()
     train(tmp_path / "straight", configs)
     requests = Requests()
     events = train_batch(configs, folders(tmp_path / "stopped", configs), requests, workers=2)
-    real = Batch.test
+    real = DeviceEngine.evaluate
 
-    def ask_and_test(batch, members, asked_to_stop):
+    def ask_and_evaluate(engine, runs, should_stop):
         requests.stop = 1
-        return real(batch, members, asked_to_stop)
+        return real(engine, runs, should_stop)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Batch, "test", ask_and_test)
+        patch.setattr(DeviceEngine, "evaluate", ask_and_evaluate)
         told = list(events)
     assert isinstance(told[-1][1], Interrupted)
     assert not any(isinstance(event, Evaluated) for _, event in told)
@@ -104,7 +104,7 @@ def test_a_batch_whose_process_is_killed_goes_on_bit_for_bit(tmp_path):
     configs = mixed()
     train(tmp_path / "straight", configs)
     with (
-        at_step(121, lambda batch: batch.pool.workers[0].process.kill()),
+        at_step(121, lambda engine: engine.pool.workers[0].process.kill()),
         pytest.raises(EnvironmentWorkerDied, match="killed by SIGKILL"),
     ):
         train(tmp_path / "killed", configs, checkpoint_minutes=0.001)

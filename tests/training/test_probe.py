@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from environments import tiny
 
 from saclab.algorithm.networks import NETWORKS
 from saclab.protocols import make_config
-from saclab.training.run import Run
+from saclab.training.local_engine import LocalEngine
 
 DISCOUNT, ALPHA, REWARD = 0.6, 0.5, 2.0
 SETTINGS = {
@@ -40,12 +41,12 @@ def test_a_constant_reward_is_worth_itself_before_a_terminal_state_and_all_its_f
     terminal, worth
 ):
     assert tiny.TIME_LIMIT == 5
-    run = Run(make_config("Constant-v0", "sac", environment_arguments={"terminal": terminal}, overrides=SETTINGS))
+    config = make_config("Constant-v0", "sac", environment_arguments={"terminal": terminal}, overrides=SETTINGS)
     ends = []
-    while run.finish_reason() is None:
-        ends += run.step()
-    run.close()
+    with closing(LocalEngine.new(config)) as engine:
+        while engine.run.finish_reason() is None:
+            ends += engine.step().ended.get(0, [])
     assert {episode.terminated for episode in ends} == {terminal}
     q = NETWORKS["mlp"](2, (16,), 1, "relu").apply
-    values = [q(critic, np.array([1.0, 0.3], np.float32))[0] for critic in np.asarray(run.learner_state.critic)]
+    values = [q(critic, np.array([1.0, 0.3], np.float32))[0] for critic in np.asarray(engine.learner_state.critic)]
     assert values == pytest.approx([worth, worth], abs=0.1)

@@ -1,10 +1,10 @@
-"""What a batch computes on its devices: S slots side by side, each with a learner and a replay buffer of its own.
+"""What a run group computes on its devices: S slots side by side, each with a learner and a replay buffer of its own.
 
 Two compiled functions. `act` chooses the next actions of all runs; `advance` stores their new transitions, draws the
 minibatches and makes the updates. They are two because what one call gives is ready only when all of it is: the
 actions would otherwise wait for the updates, and the physics for the actions.
 
-Whatever the host knows of a step arrives as one array, and the actions leave as one array. Slots are spread over all
+What the host puts into a step comes as one array, and the actions leave as one array. Slots are spread over all
 devices; as runs have nothing to do with each other, no device ever waits for another.
 """
 
@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from saclab.algorithm.learner import make_learner
-from saclab.algorithm.numbers import Numbers
+from saclab.algorithm.learner import Learner, make_learner
+from saclab.algorithm.numbers import Numbers, numbers_of
 from saclab.algorithm.types import LearnerState
 from saclab.config import AlgorithmSettings
 from saclab.replay import RowLayout
@@ -30,19 +30,19 @@ RUNS: Any = PartitionSpec("runs")  # type: ignore[no-untyped-call]
 UNROLLED_UPDATES = 4  # of one call; more are a loop, which compiles sooner
 
 
-class Arrival(NamedTuple):
-    """How what arrives for a step lies in one array i32[S, width]; floating-point numbers are there as their bits."""
+class StepInputs(NamedTuple):
+    """How the inputs of a step lie in one array i32[S, width]; floating-point numbers are there as their bits."""
 
     layout: RowLayout
     environments: int
-    """E, of each run."""
+    """E: environments of each run."""
     updates: int
-    """U, made after this step."""
+    """U: updates made after this step."""
     batch_size: int
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of each part, for one slot."""
+        """The shape of each part, for one slot."""
         return {
             "observation": (self.environments, self.layout.observation_size),
             "noise": (self.environments, self.layout.action_size),
@@ -78,7 +78,7 @@ class Program:
         """For at least `slots` slots: as many as can be spread evenly over the devices.
 
         Args:
-            settings: of any run of the batch; its plain numbers play no part.
+            settings: of any run of the group; its plain numbers play no part.
             layout: of the transitions.
             environments: of each run.
             slots: how many runs there may be.
@@ -98,8 +98,8 @@ class Program:
         """Host arrays [S, …] on the devices."""
         return jax.device_put(tree, self.sharding)
 
-    def arrival(self, updates: int) -> Arrival:
-        return Arrival(self.layout, self.environments, updates, self.settings.batch_size)
+    def inputs(self, updates: int) -> StepInputs:
+        return StepInputs(self.layout, self.environments, updates, self.settings.batch_size)
 
     def advance(
         self, updates: int, numbers: Numbers, state: LearnerState, replay: jax.Array, packed: jax.Array
@@ -125,32 +125,39 @@ class Program:
 
     def _act(self, numbers: Numbers, actor: jax.Array, packed: jax.Array) -> jax.Array:
         """Actions f32[E, A] of one slot."""
-        arrival = self.arrival(0)
+        inputs = self.inputs(0)
         policy = self._learner(numbers).policy
-        action: jax.Array = policy.act(actor, arrival.unpack(packed, "observation"), arrival.unpack(packed, "noise"))
+        action: jax.Array = policy.act(actor, inputs.unpack(packed, "observation"), inputs.unpack(packed, "noise"))
         return action
 
     def _advance_slot(
         self, updates: int, numbers: Numbers, state: LearnerState, replay: jax.Array, packed: jax.Array
     ) -> tuple[LearnerState, jax.Array, jax.Array]:
-        arrival = self.arrival(updates)
-        positions = (arrival.unpack(packed, "position") + jnp.arange(self.environments)) % len(replay)
-        replay = replay.at[positions].set(arrival.unpack(packed, "rows"))
+        inputs = self.inputs(updates)
+        positions = (inputs.unpack(packed, "position") + jnp.arange(self.environments)) % len(replay)
+        replay = replay.at[positions].set(inputs.unpack(packed, "rows"))
         learner = self._learner(numbers)
 
         def update(state: LearnerState, drawn: jax.Array) -> tuple[LearnerState, jax.Array]:
             state, metrics = learner.update(state, self.layout.unpack(replay[drawn]))
             return state, jnp.stack(metrics)
 
-        drawn = arrival.unpack(packed, "drawn")
+        drawn = inputs.unpack(packed, "drawn")
         unrolled = updates if 0 < updates <= UNROLLED_UPDATES else 1
         state, metrics = jax.lax.scan(update, state, drawn, unroll=unrolled)
         return state, replay, metrics
 
-    def _learner(self, numbers: Numbers) -> Any:
+    def _learner(self, numbers: Numbers) -> Learner:
         return make_learner(self.settings, self.layout.observation_size, self.layout.action_size, numbers)
 
     def _mapped(self, function: Callable[..., Any], donated: tuple[int, ...]) -> Callable[..., Any]:
         """Map over the slots, each device over its own."""
         over_devices = jax.shard_map(jax.vmap(function), mesh=self.mesh, in_specs=RUNS, out_specs=RUNS, check_vma=False)
         return jax.jit(over_devices, donate_argnums=donated)
+
+
+def numbers_for(settings: AlgorithmSettings, action_size: int) -> Numbers:
+    """A run's plain numbers, each of the same type for all runs, also where a user has written 1 for 1.0."""
+    kinds = {"temperature_learned": np.bool_, "snapshot_interval": np.int32}
+    numbers = numbers_of(settings, action_size)._asdict()
+    return Numbers(**{name: kinds.get(name, np.float32)(number) for name, number in numbers.items()})

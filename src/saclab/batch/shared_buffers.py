@@ -1,4 +1,4 @@
-"""The arrays through which the processes of a batch exchange steps: shared memory that no crash leaves behind."""
+"""The arrays through which the processes of a run group exchange steps: shared memory that no crash leaves behind."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from saclab.replay import RowLayout
 class Sizes(NamedTuple):
     runs: int
     environments: int
-    """Of each run."""
+    """Environments of each run."""
     observation_size: int
     action_size: int
 
 
-class Board:
+class SharedBuffers:
     """N = runs × environments; the environments of run r are at [r · environments, (r + 1) · environments)."""
 
     def __init__(self, sizes: Sizes, file_descriptor: int | None = None) -> None:
@@ -68,7 +68,7 @@ class Board:
         self.active = arrays["active"]
         """bool[runs]: the others are not stepped."""
         self.stop = arrays["stop"]
-        """bool[1]: break off the test."""
+        """bool[1]: break off the evaluation."""
 
     def close(self) -> None:
         os.close(self.file_descriptor)

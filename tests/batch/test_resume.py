@@ -10,7 +10,7 @@ from resume.helpers import assert_same_run
 from saclab.batch.engine import DeviceEngine
 from saclab.batch.loop import train_batch
 from saclab.batch.pool import EnvironmentWorkerDied
-from saclab.training import loop
+from saclab.training import checkpoint, loop
 from saclab.training.checkpoint import CheckpointError
 from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
 from saclab.training.events import Evaluated, Interrupted, Saved, UpdatesLogged
@@ -34,6 +34,23 @@ def test_a_stopped_batch_goes_on_bit_for_bit(tmp_path, environment, stop):
         folders(tmp_path / "straight", configs), folders(tmp_path / "stopped", configs), strict=True
     ):
         assert_same_run(straight, stopped)
+
+
+def test_a_group_that_goes_on_reads_each_file_of_its_checkpoints_once(tmp_path, monkeypatch):
+    """A replay buffer may have gigabytes."""
+    configs, reads, real = mixed(), [], checkpoint.read_arrays
+    monkeypatch.setattr(checkpoint, "SEGMENT_ROWS", 40)
+    stop_at(150, tmp_path, configs)
+
+    def read_arrays(folder, name, entry):
+        reads.append((folder.parent.parent.name, name))
+        return real(folder, name, entry)
+
+    monkeypatch.setattr(checkpoint, "read_arrays", read_arrays)
+    with closing(train_batch(configs, folders(tmp_path, configs), workers=1)) as events:
+        assert next(events)[1].resumed_at_step == 150
+    assert len(reads) == len(set(reads))
+    assert {("run-0", "replay-0003.safetensors"), ("run-2", "learner.safetensors")} < set(reads)
 
 
 @pytest.mark.slow

@@ -71,7 +71,11 @@ class DeviceEngine:
         self.pool = restored_pool(starts, spec, workers)
 
     def step(self) -> StepResult:
-        """As `Engine.step`; raises EnvironmentWorkerDied if a process that steps environments is gone."""
+        """Take a step of every run.
+
+        Raises:
+            EnvironmentWorkerDied: if a process that steps environments is gone.
+        """
         failures = self.pool.step(self._next_actions())
         broken = {run: Broken(error, self.snapshot(run)) for run, error in failures.items()}  # as before this step
         active = [run for run in self.active if run not in broken]
@@ -83,14 +87,19 @@ class DeviceEngine:
         return StepResult(ended, broken) if ended or broken else NOTHING_HAPPENED
 
     def drop(self, run: int) -> None:
-        """As `Engine.drop`. The slot stays: what the others compute is the same."""
+        """Go on without a run. Its slot stays: what the others compute is the same."""
         self.active.remove(run)
         self.pool.drop(run)
 
     def evaluate(
         self, runs: Sequence[int], should_stop: Callable[[], bool]
     ) -> Mapping[int, EvaluationEpisodes | RunBroken]:
-        """As `Engine.evaluate`; raises EnvironmentWorkerDied if a process that plays the episodes is gone."""
+        """Evaluate the policies of these runs, shared out among the processes.
+
+        Raises:
+            Stopped: when `should_stop`; the runs are as before.
+            EnvironmentWorkerDied: if a process that plays the episodes is gone.
+        """
         jobs = [job for run in runs for job in evaluation_jobs(run, self.runs[run].evaluation_seeds(), self.actor(run))]
         replies = self.pool.work_off(jobs, should_stop)
         owners = [header["run"] for header, _ in jobs]
@@ -113,7 +122,7 @@ class DeviceEngine:
         }
 
     def actor(self, run: int) -> np.ndarray:
-        """As `Engine.actor`, of all runs copied once after each update."""
+        """One policy's parameters f32[P] on the host; those of all runs are copied once after each update."""
         self.flush()
         if self._host_actors is None:
             self._host_actors = np.array(self.state.actor)

@@ -126,7 +126,7 @@ class EnvironmentPool:
         return [replies[index] for index in range(len(jobs))]
 
     def capture(self, run: int) -> list[dict[str, Any] | None]:
-        """As `TrainingEnvironments.capture`."""
+        """What `TrainingEnvironments.capture` gives of a run's environments."""
         states: list[dict[str, Any] | None] = []
         for worker in self._owners(run):
             worker.send({"do": "capture", "run": run}, {})
@@ -135,7 +135,11 @@ class EnvironmentPool:
         return states
 
     def restore(self, run: int, states: list[dict[str, Any] | None], new_seeds: list[int]) -> list[int]:
-        """As `TrainingEnvironments.restore`; raises EnvironmentStateError for states that do not fit."""
+        """Continue a run's episodes, as `TrainingEnvironments.restore` does.
+
+        Raises:
+            EnvironmentStateError: for states that do not fit.
+        """
         restarted: list[int] = []
         first = 0
         for worker in self._owners(run):

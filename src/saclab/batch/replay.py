@@ -44,7 +44,7 @@ class SlotRows:
 
 @dataclass(frozen=True)
 class SlotReplay:
-    """As `training.checkpoint.Replay`."""
+    """The replay buffer of one slot, as far as a checkpoint has to read it."""
 
     rows: SlotRows
     capacity: int

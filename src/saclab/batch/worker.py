@@ -114,7 +114,7 @@ class EnvironmentWorker:
         return {}, episodes._asdict()
 
     def q_bias(self, header: dict[str, Any], arrays: Arrays) -> Message:
-        """As `Engine.measure_q_bias`, of one run."""
+        """How far one run's critics are from Monte-Carlo soft returns."""
         config, learner = self.configs[header["run"]], self._learner(header["run"])
         critics = critics_of(config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"])
         try:

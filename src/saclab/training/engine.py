@@ -69,10 +69,11 @@ class Engine(Protocol):
     def actor(self, run: int) -> np.ndarray:
         """The policy's parameters f32[P] on the host, after every update that was made."""
 
-    def snapshot(self, run: int) -> Snapshot: ...
+    def snapshot(self, run: int) -> Snapshot:
+        """The run as it is now, after every update that was made."""
 
     def capture_environments(self, run: int) -> EnvironmentStates:
-        """As `TrainingEnvironments.capture`."""
+        """The exact state of each environment of a run; None where it cannot be captured."""
 
     def drop(self, run: int) -> None:
         """Go on without a run that has finished or failed."""

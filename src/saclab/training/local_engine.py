@@ -103,7 +103,7 @@ class LocalEngine:
         return action
 
     def actor(self, run: int) -> np.ndarray:
-        """As `Engine.actor`, copied once per update."""
+        """The policy's parameters f32[P] on the host, copied once per update."""
         if self._actor is None:
             self._actor = np.array(self.learner_state.actor)
         return self._actor

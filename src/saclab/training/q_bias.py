@@ -54,7 +54,7 @@ class QBias(NamedTuple):
     """State-action pairs that were compared."""
     mean_q: float
     mean_return: float
-    """Of the Monte-Carlo soft returns."""
+    """Mean of the Monte-Carlo soft returns."""
     mean_bias: float
     """Mean of (Q − G) / |mean of G|."""
     bias_spread: float

@@ -183,7 +183,7 @@ class RunState:
         return values
 
     def close_window(self) -> np.ndarray:
-        """As `window_array`; a new window begins."""
+        """The window's metrics, as `window_array` gives them; a new window begins."""
         values = self.window_array()
         self.window, self.logged_updates = [], self.counters.updates
         return values

@@ -16,7 +16,7 @@ from saclab.training.learners import METRICS, finite_arrays, initial_learner, le
 from saclab.training.run_state import Counters, RunState
 
 EnvironmentStates = list[dict[str, Any] | None]
-"""As `TrainingEnvironments.capture` gives them."""
+"""What `TrainingEnvironments.capture` gives."""
 
 
 class Start(NamedTuple):

@@ -1,11 +1,11 @@
-"""What batches of runs cost on this machine's devices, and what they gain.
+"""What run groups cost on this machine's devices, and what they gain.
 
     python benchmarks/batches.py [HalfCheetah-v4] [--runs 1 4 16 64] [--seconds 10] [--alone]
 
-Kept in benchmarks/results/batches-<device>-<environment>.json: updates per second, summed over the runs of a batch, of
-the compiled program alone (plain and averaged, K = 10); environment steps per second of whole batches at one update per
+Kept in benchmarks/results/batches-<device>-<environment>.json: updates per second, summed over the runs of a group, of
+the compiled program alone (plain and averaged, K = 10); environment steps per second of whole groups at one update per
 step, with the share of each part of a step; and with --alone the same job by one run alone on all cores, and by as many
-processes as cores, one run each, in turn with the batches. Compilation and the random steps are outside all rates.
+processes as cores, one run each, in turn with the groups. Compilation and the random steps are outside all rates.
 Evaluations and logs are left out.
 """
 
@@ -27,12 +27,14 @@ import jax
 import numpy as np
 from keep import keep
 
-from saclab.batch.batch import Batch
+from saclab.batch.builder import DeviceBuilder
+from saclab.batch.engine import DeviceEngine
 from saclab.config import Config
 from saclab.machine import thread_limits, usable_cores
 from saclab.protocols import make_config
+from saclab.training.engine import build_new
+from saclab.training.local_engine import LocalEngine
 from saclab.training.process import device_name, prepare_process
-from saclab.training.run import Run
 
 RANDOM_STEPS = 300
 ROUNDS = 5
@@ -44,14 +46,14 @@ def config(environment: str, variant: str, seed: int) -> Config:
     return make_config(environment, variant, "standard", seed, None, overrides)
 
 
-def begun(environment: str, variant: str, runs: int) -> Batch:
-    """A batch after its random steps and its first updates."""
-    batch = Batch([config(environment, variant, seed) for seed in range(runs)], 0, len(usable_cores()))
-    batch.begin()
-    while batch.updates < 20:
-        batch.step()
-    batch.on_host()
-    return batch
+def begun(environment: str, variant: str, runs: int) -> DeviceEngine:
+    """A run group after its random steps and its first updates."""
+    configs = [config(environment, variant, seed) for seed in range(runs)]
+    engine = build_new(DeviceBuilder(configs, 0, len(usable_cores())))
+    while engine.updates < 20:
+        engine.step()
+    engine.actor(0)
+    return engine
 
 
 def rate(count: Callable[[], int], step: Callable[[], object], wait: Callable[[], object], seconds: float) -> float:
@@ -66,44 +68,44 @@ def rate(count: Callable[[], int], step: Callable[[], object], wait: Callable[[]
     return statistics.median(rates)
 
 
-def program_alone(batch: Batch, seconds: float) -> float:
+def program_alone(engine: DeviceEngine, seconds: float) -> float:
     """Updates per second, summed over the runs, without environments."""
-    runs, made = len(batch.members), 0
-    drawn = np.random.default_rng(0).integers(0, RANDOM_STEPS, (runs, 1, batch.config.algorithm.batch_size), np.int32)
-    packed = batch.program.put(batch.program.arrival(1).pack(batch.program.slots, drawn=drawn))
+    runs, made = len(engine.runs), 0
+    drawn = np.random.default_rng(0).integers(0, RANDOM_STEPS, (runs, 1, engine.batch_size), np.int32)
+    packed = engine.program.put(engine.program.inputs(1).pack(engine.program.slots, drawn=drawn))
 
     def update() -> None:
         nonlocal made
-        batch._advance(1, packed)
+        engine._advance(1, packed)
         made += runs
         if made % (20 * runs) == 0:  # no further ahead of the device than a training would be
-            batch.state.key.block_until_ready()
+            engine.state.key.block_until_ready()
 
-    value = rate(lambda: made, update, lambda: batch.state.key.block_until_ready(), seconds)
-    batch.undelivered, batch.undelivered_updates = [], 0
+    value = rate(lambda: made, update, lambda: engine.state.key.block_until_ready(), seconds)
+    engine.undelivered = []
     return value
 
 
-def whole_batch(batch: Batch, seconds: float) -> tuple[float, dict[str, float]]:
+def whole_group(engine: DeviceEngine, seconds: float) -> tuple[float, dict[str, float]]:
     """Environment steps per second, summed, and the share of a step that each part takes of the host's time."""
     spent = dict.fromkeys(PARTS, 0.0)
     waited = 0.0
     for name in PARTS:
-        owner = batch.pool if name == "pool.step" else batch
+        owner = engine.pool if name == "pool.step" else engine
         clock(owner, name.removeprefix("pool."), spent, name)
-    real = batch._next_actions
+    real = engine._next_actions
 
     def next_actions() -> np.ndarray:
         nonlocal waited
         began = time.perf_counter()
         actions = real()
         waited += time.perf_counter() - began
-        batch.undelivered, batch.undelivered_updates = [], 0  # as a line of the log does
+        engine.undelivered = []  # as a line of the log does
         return actions
 
-    batch._next_actions = next_actions  # type: ignore[method-assign]
-    runs, began = len(batch.members), time.perf_counter()
-    value = rate(lambda: runs * batch.steps, batch.step, lambda: batch.state.key.block_until_ready(), seconds)
+    engine._next_actions = next_actions  # type: ignore[method-assign]
+    runs, began = len(engine.runs), time.perf_counter()
+    value = rate(lambda: runs * engine.steps, engine.step, lambda: engine.state.key.block_until_ready(), seconds)
     whole = time.perf_counter() - began
     shares = {name: round(part / whole, 3) for name, part in spent.items()}
     return value, {**shares, "waiting for actions": round((waited - spent["_launch"]) / whole, 3)}
@@ -134,15 +136,16 @@ def alone(environment: str, variant: str, seconds: float, places: list[list[int]
 
 
 def one_alone(environment: str, variant: str, seconds: float) -> float:
-    with closing(Run(config(environment, variant, 0))) as run:
+    with closing(LocalEngine.new(config(environment, variant, 0))) as engine:
+        run = engine.run
         while run.counters.updates < 20:
-            run.step()
+            engine.step()
 
         def step() -> None:
-            run.step()
+            engine.step()
             run.window = []
 
-        return rate(lambda: run.counters.steps, step, lambda: run.learner_state.key.block_until_ready(), seconds)
+        return rate(lambda: run.counters.steps, step, lambda: engine.learner_state.key.block_until_ready(), seconds)
 
 
 def main() -> None:
@@ -175,10 +178,10 @@ def main() -> None:
 
 def measure(options: argparse.Namespace, variant: str, runs: int) -> dict[str, Any]:
     row: dict[str, Any] = {"variant": variant, "runs": runs}
-    with closing(begun(options.environment, variant, runs)) as batch:
-        steps, row["shares"] = whole_batch(batch, options.seconds)
+    with closing(begun(options.environment, variant, runs)) as engine:
+        steps, row["shares"] = whole_group(engine, options.seconds)
         row["steps_per_second"] = round(steps, 1)
-        row["program_updates_per_second"] = round(program_alone(batch, options.seconds), 1)
+        row["program_updates_per_second"] = round(program_alone(engine, options.seconds), 1)
         stats = jax.devices()[0].memory_stats() or {}
         row["device_peak_bytes"] = stats.get("peak_bytes_in_use")
     if options.alone:

@@ -32,9 +32,9 @@ from saclab.protocols import make_config
 from saclab.replay import ReplayBuffer
 from saclab.training.evaluation import Evaluator
 from saclab.training.events import UpdatesLogged
+from saclab.training.local_engine import LocalEngine
 from saclab.training.loop import train
 from saclab.training.process import prepare_process
-from saclab.training.run import Run
 
 WARM_UPDATES = 100
 
@@ -67,7 +67,7 @@ def clocked() -> Iterator[Clock]:
     """Every part of the loop tells the clock."""
     clock = Clock()
     parts = [
-        (Run, "_next_action", "acting"),
+        (LocalEngine, "_next_action", "acting"),
         (TrainingEnvironments, "step", "environment around the simulator"),
         (ReplayBuffer, "add", "replay: store"),
         (ReplayBuffer, "sample", "replay: draw"),
@@ -77,13 +77,13 @@ def clocked() -> Iterator[Clock]:
     with ExitStack() as stack:
         for owner, name, part in parts:
             stack.enter_context(mock.patch.object(owner, name, clock.timed(part, getattr(owner, name))))
-        made = Run.__init__
+        made = LocalEngine.__init__
 
-        def make(run: Run, *arguments: Any) -> None:
-            made(run, *arguments)
-            run.update = clock.timed("update", run.update, wait=True)
+        def make(engine: LocalEngine, *arguments: Any) -> None:
+            made(engine, *arguments)
+            engine.update = clock.timed("update", engine.update, wait=True)
 
-        stack.enter_context(mock.patch.object(Run, "__init__", make))
+        stack.enter_context(mock.patch.object(LocalEngine, "__init__", make))
         yield clock
 
 
@@ -112,29 +112,31 @@ def loop_breakdown(environment: str, variant: str, updates: int) -> dict[str, fl
 def update_breakdown(environment: str, variant: str, updates: int) -> dict[str, float]:
     """Milliseconds of one update: its matrix products done alone, calling XLA, and all that is left."""
     settings = {"random_steps": 1000, "replay_capacity": 10_000}
-    run = Run(make_config(environment, variant, "paper", overrides=settings))
+    engine = LocalEngine.new(make_config(environment, variant, "paper", overrides=settings))
+    run = engine.run
     while run.counters.updates < WARM_UPDATES:
-        run.step()
-    rows = run.replay.sample(run.sampling, run.config.algorithm.batch_size)
-    products = matrix_products(run.config.algorithm, run.replay.layout)
+        engine.step()
+    rows = engine.replay.sample(run.sampling, run.config.algorithm.batch_size)
+    products = matrix_products(run.config.algorithm, engine.replay.layout)
     operands = [[jnp.ones(shape) for shape in product.shapes] for product in products]
 
     def update() -> None:
-        run.learner_state, metrics = run.update(run.numbers, run.learner_state, rows, run.context)
+        engine.learner_state, metrics = engine.update(engine.numbers, engine.learner_state, rows, engine.context)
         metrics.block_until_ready()
 
     @jax.jit
     def all_products(operands: list[list[jax.Array]]) -> list[jax.Array]:
         return [product.multiply(*pair) for product, pair in zip(products, operands, strict=True)]
 
+    given = (engine.numbers, engine.learner_state, rows, engine.context)
     nothing = jax.jit(lambda numbers, state, rows, context: (state, rows[0]))
     timed = {
         "whole": update,
         "matrix products": lambda: jax.block_until_ready(all_products(operands)),
-        "calling XLA": lambda: jax.block_until_ready(nothing(run.numbers, run.learner_state, rows, run.context)),
+        "calling XLA": lambda: jax.block_until_ready(nothing(*given)),
     }
     milliseconds = alternating(timed, updates)
-    run.close()
+    engine.close()
     parts = {name: milliseconds[name] for name in ("matrix products", "calling XLA")}
     parts["matrix products"] -= parts["calling XLA"]
     parts["everything else XLA does"] = milliseconds["whole"] - sum(parts.values())
@@ -169,7 +171,7 @@ def main() -> None:
     prepare_process()
     what = f"{options.environment}, {options.variant}"
     loop = loop_breakdown(options.environment, options.variant, options.updates)
-    show(f"{what}: per update, with its 5 environment steps and their share of the evaluations", loop)
+    show(f"{what}: per update, with its 5 environment steps and their share of the tests", loop)
     update = update_breakdown(options.environment, options.variant, options.updates)
     show(f"{what}: one update", update)
     keep(f"breakdown-{options.environment}-{options.variant}", loop_milliseconds=loop, update_milliseconds=update)

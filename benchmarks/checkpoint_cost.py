@@ -17,25 +17,28 @@ from pathlib import Path
 import numpy as np
 
 from saclab.protocols import make_config
-from saclab.training.checkpoint import load_newest_checkpoint, save_checkpoint
-from saclab.training.run import Run
+from saclab.training.checkpoint import save_checkpoint
+from saclab.training.common_checkpoint import load_newest_checkpoint
+from saclab.training.local_engine import LocalEngine
+from saclab.training.snapshot import to_checkpoint
 
 MIB = 2**20
 
 
-def fill(run: Run, count: int, generator: np.random.Generator) -> None:
+def fill(engine: LocalEngine, count: int, generator: np.random.Generator) -> None:
     """Let `count` transitions of random numbers pass through the buffer."""
-    replay = run.replay
+    replay = engine.replay
     positions = np.arange(replay.added, replay.added + count) % replay.capacity
     replay.rows[positions] = generator.standard_normal((count, replay.layout.width), np.float32)
     replay.added += count
-    run.counters.steps += count
+    engine.run.counters.steps += count
 
 
-def save(run: Run, folder: Path) -> tuple[float, int, int]:
+def save(engine: LocalEngine, folder: Path) -> tuple[float, int, int]:
     """Seconds, bytes of the checkpoint, and those of them that were written and not linked."""
     began = time.perf_counter()
-    path = save_checkpoint(folder, run.counters.steps, run.capture(), run.replay)
+    content = to_checkpoint(engine.snapshot(0), engine.capture_environments(0))
+    path = save_checkpoint(folder, engine.run.counters.steps, content, engine.replay)
     seconds = time.perf_counter() - began
     return seconds, size(path), written[0]
 
@@ -61,19 +64,19 @@ def count_written() -> None:
 
 
 def measure(environment: str, folder: Path, rows: int, new_rows: int) -> None:
-    run = Run(make_config(environment, "averaged-auto", overrides={"replay_capacity": rows}))
+    engine = LocalEngine.new(make_config(environment, "averaged-auto", overrides={"replay_capacity": rows}))
     generator = np.random.default_rng(0)
-    fill(run, rows, generator)
-    print(f"{environment}, {rows:,} transitions of {run.replay.layout.width} numbers, {new_rows:,} between saves")
+    fill(engine, rows, generator)
+    print(f"{environment}, {rows:,} transitions of {engine.replay.layout.width} numbers, {new_rows:,} between saves")
     for name in ("first", "second", "later", "later", "later"):
         written[0] = 0
-        seconds, total, new = save(run, folder)
+        seconds, total, new = save(engine, folder)
         print(f"  {name:<7} {total / MIB:7.1f} MiB, {new / MIB:7.1f} written ({new / total:4.0%}), {seconds:6.2f} s")
-        fill(run, new_rows, generator)
+        fill(engine, new_rows, generator)
     began = time.perf_counter()
-    assert load_newest_checkpoint(folder, run.replay, print) is not None
+    assert load_newest_checkpoint(folder, engine.replay, print) is not None
     print(f"  load    {total / MIB:7.1f} MiB, checked against its checksums, {time.perf_counter() - began:6.2f} s")
-    run.close()
+    engine.close()
 
 
 def main() -> None:

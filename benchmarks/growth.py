@@ -18,8 +18,8 @@ from keep import keep
 from operations import update_operations
 
 from saclab.protocols import make_config
+from saclab.training.local_engine import LocalEngine
 from saclab.training.process import prepare_process
-from saclab.training.run import Run
 
 ROUNDS, UPDATES = 5, 40
 ROWS: list[tuple[str, dict[str, Any]]] = [
@@ -38,35 +38,39 @@ ROWS: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
-def prepared(changes: dict[str, Any]) -> Run:
+def prepared(changes: dict[str, Any]) -> LocalEngine:
     """A run with a full replay buffer, past its random steps and its compilation."""
-    run = Run(make_config("HalfCheetah-v4", "sac", "paper", overrides={"random_steps": 1024, **changes}))
-    while run.counters.updates < 10:
-        run.step()
-    filled = run.replay.added
-    rest = np.arange(filled, run.replay.capacity)
-    run.replay.rows[rest] = run.replay.rows[rest % filled]
-    run.replay.added = max(filled, run.replay.capacity)
-    return run
+    config = make_config("HalfCheetah-v4", "sac", "paper", overrides={"random_steps": 1024, **changes})
+    engine = LocalEngine.new(config)
+    while engine.run.counters.updates < 10:
+        engine.step()
+    replay = engine.replay
+    filled = replay.added
+    rest = np.arange(filled, replay.capacity)
+    replay.rows[rest] = replay.rows[rest % filled]
+    replay.added = max(filled, replay.capacity)
+    return engine
 
 
-def milliseconds_per_update(run: Run) -> float:
-    began, first = time.perf_counter(), run.counters.updates
-    while run.counters.updates < first + UPDATES:
-        run.step()
-    run.window_array()
-    run.window = []
-    return 1000 * (time.perf_counter() - began) / (run.counters.updates - first)
+def milliseconds_per_update(engine: LocalEngine) -> float:
+    counters = engine.run.counters
+    began, first = time.perf_counter(), counters.updates
+    while counters.updates < first + UPDATES:
+        engine.step()
+    engine.run.close_window()
+    return 1000 * (time.perf_counter() - began) / (counters.updates - first)
 
 
 def main() -> None:
     prepare_process()
-    runs = {name: prepared(changes) for name, changes in ROWS}
-    times: dict[str, list[float]] = {name: [] for name in runs}
+    engines = {name: prepared(changes) for name, changes in ROWS}
+    times: dict[str, list[float]] = {name: [] for name in engines}
     for _ in range(ROUNDS):
-        for name, run in runs.items():
-            times[name].append(milliseconds_per_update(run))
-    operations = {name: update_operations(run.config.algorithm, run.replay.layout) for name, run in runs.items()}
+        for name, engine in engines.items():
+            times[name].append(milliseconds_per_update(engine))
+    operations = {
+        name: update_operations(engine.run.config.algorithm, engine.replay.layout) for name, engine in engines.items()
+    }
     first = ROWS[0][0]
     keep("growth", operations=operations, milliseconds_per_update=times)
     print("| | operations | ms per update | cost |\n|---|---|---|---|")

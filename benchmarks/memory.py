@@ -3,8 +3,7 @@
     python benchmarks/memory.py
 
 Each row is a training in a process of its own whose replay buffer is filled to the end, with evaluations and a
-checkpoint.
-"Constant" is the peak less 1.3 times the bytes of replay, parameters, moments and snapshots.
+checkpoint. "Constant" is the peak less 1.3 times the bytes of replay, parameters, moments and snapshots.
 """
 
 from __future__ import annotations
@@ -29,29 +28,27 @@ import json, resource, sys
 from pathlib import Path
 import jax, numpy as np
 from saclab.protocols import make_config
-from saclab.training.loop import Session, train
-from saclab.training.requests import Requests
-from saclab.training.events import Interrupted
-from saclab.training.run import Run
+from saclab.training.loop import train
+from saclab.training.local_engine import LocalEngine
 environment, variant, capacity, folder = sys.argv[1], sys.argv[2], int(sys.argv[3]), Path(sys.argv[4])
 config = make_config(environment, variant, "paper", overrides={
     "replay_capacity": capacity, "random_steps": 500, "evaluation_interval_episodes": None,
     "evaluation_interval_steps": 1000, "max_steps": 1500})
 seen = {}
-made = Run.__init__
-def make(run, *arguments):
-    made(run, *arguments)
-    seen["run"] = run
-Run.__init__ = make
+made = LocalEngine.__init__
+def make(engine, *arguments):
+    made(engine, *arguments)
+    seen["engine"] = engine
+LocalEngine.__init__ = make
 for event in train(config, folder / "run"):
-    if "filled" not in seen and seen["run"].counters.updates > 10:
+    if "filled" not in seen and seen["engine"].run.counters.updates > 10:
         seen["filled"] = True
-        replay = seen["run"].replay
+        replay = seen["engine"].replay
         replay.rows[replay.added:] = 1.0  # as full as at the end of a long run, and so is the checkpoint
         replay.added = max(replay.added, replay.capacity)
-run = seen["run"]
-learner = sum(leaf.nbytes for leaf in jax.tree.leaves(run.learner_state))
-print(json.dumps([resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, run.replay.rows.nbytes, learner]))
+engine = seen["engine"]
+learner = sum(leaf.nbytes for leaf in jax.tree.leaves(engine.learner_state))
+print(json.dumps([resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, engine.replay.rows.nbytes, learner]))
 """
 MIB = 2**20
 

@@ -14,8 +14,8 @@ import numpy as np
 from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import scalars
 from saclab.algorithm.types import Context
-from saclab.config import AlgorithmSettings
 from saclab.replay import RowLayout
+from saclab.settings import AlgorithmSettings
 
 
 class MatrixProduct(NamedTuple):

@@ -24,7 +24,7 @@ import pytest
 from saclab.algorithm.learner import Learner, make_learner
 from saclab.algorithm.scalars import Scalars, scalars
 from saclab.algorithm.types import Batch, Context, LearnerState
-from saclab.config import AlgorithmSettings, structure
+from saclab.settings import AlgorithmSettings, structure
 from saclab.variants import VARIANTS, variant_settings
 
 jax.config.update("jax_disable_most_optimizations", True)

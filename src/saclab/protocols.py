@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names, replace_settings
+from saclab.config import Config
 from saclab.errors import unknown_name
+from saclab.settings import AlgorithmSettings, TrainingSettings, field_names, replace_settings
 from saclab.variants import default_settings, task_name, variant_changes
 
 

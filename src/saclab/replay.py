@@ -9,9 +9,11 @@ import numpy as np
 
 from saclab.algorithm.networks.network import Array
 from saclab.algorithm.types import Batch
+from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import Transitions
 from saclab.errors import SettingError
 from saclab.machine import available_memory
+from saclab.settings import AlgorithmSettings
 
 
 class RowLayout(NamedTuple):
@@ -51,6 +53,11 @@ class RowLayout(NamedTuple):
             name: rows[:, end - width : end] for (name, width), end in zip(self.columns.items(), ends, strict=True)
         }
         return Batch(**parts | {"terminated": parts["terminated"][:, 0]})
+
+
+def layout_of(spec: EnvironmentSpec, settings: AlgorithmSettings) -> RowLayout:
+    """The columns of a run's transitions."""
+    return RowLayout(spec.observation_size, spec.action_size, len(settings.reward_terms) + 1)
 
 
 class ReplayBuffer:

@@ -11,10 +11,11 @@ import numpy as np
 import safetensors.numpy
 
 from saclab.algorithm.policy import make_policy
-from saclab.config import AlgorithmSettings, Config, algorithm_from_json
+from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.files import replace_file, write_json
+from saclab.settings import AlgorithmSettings, algorithm_from_json
 
 ARRAYS, DESCRIPTION = "policy.safetensors", "policy.json"
 

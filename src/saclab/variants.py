@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from saclab.config import AlgorithmSettings, field_names, replace_settings
 from saclab.errors import unknown_name
+from saclab.settings import AlgorithmSettings, field_names, replace_settings
 
 
 @dataclass(frozen=True)

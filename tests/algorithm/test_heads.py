@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from saclab.algorithm.heads import HEADS, CriticHead
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 
 @pytest.fixture(autouse=True)

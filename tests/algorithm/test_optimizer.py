@@ -8,7 +8,7 @@ import pytest
 
 from saclab.algorithm.optimizer import SCHEDULES, Trainer, descend
 from saclab.algorithm.scalars import scalars
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 
 def rates(trainer: Trainer, settings: AlgorithmSettings, planned_updates: int, steps: int) -> list[float]:

@@ -13,7 +13,7 @@ from scipy.integrate import trapezoid
 
 from saclab.algorithm.networks.network import ACTIVATIONS
 from saclab.algorithm.policy import make_policy, squash
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 

@@ -17,7 +17,7 @@ import pytest
 from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import scalars
 from saclab.algorithm.types import Batch, Context
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 DISCOUNT, ALPHA, UPDATES, BATCH = 0.6, 0.5, 1000, 32
 UNIFORM_ENTROPY = math.log(2)

@@ -11,7 +11,7 @@ import pytest
 from conftest import make_case
 
 from saclab.algorithm.losses import temperature_loss
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 
 def loss_and_slope(log_alpha: float, entropy: float, target: float, factor: str) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""What the tests of batches share: small runs of one structure, and stopping them at a chosen step."""
+"""What the tests of run groups share: small runs of one structure, and stopping them at a chosen step."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from unittest import mock
 import pytest
 from resume.helpers import SMALL as ALONE
 
-from saclab.batch.batch import Batch
+from saclab.batch.builder import DeviceBuilder
+from saclab.batch.engine import DeviceEngine
 from saclab.batch.loop import train_batch
 from saclab.config import Config
 from saclab.protocols import make_config
+from saclab.training.engine import build_new
 from saclab.training.events import Event, Failed
 from saclab.training.requests import Requests
 
@@ -27,7 +29,7 @@ def config(variant: str = "sac-auto", seed: int = 0, environment: str = "Pendulu
 
 
 def mixed(**changes: object) -> list[Config]:
-    """Runs of one batch that differ in the seed and in plain numbers."""
+    """Runs of one group that differ in the seed and in plain numbers."""
     return [
         config("sac", 0, **changes),
         config("sac-auto", 1, **changes),
@@ -35,12 +37,17 @@ def mixed(**changes: object) -> list[Config]:
     ]
 
 
+def engine_of(configs: Sequence[Config], workers: int = 1) -> DeviceEngine:
+    """The engine of these runs before their first step."""
+    return build_new(DeviceBuilder(configs, 0, workers))
+
+
 def folders(root: Path, configs: Sequence[Config]) -> list[Path]:
     return [root / f"run-{index}" for index in range(len(configs))]
 
 
 def train(root: Path, configs: Sequence[Config], workers: int = 2, **options: object) -> list[tuple[int, Event]]:
-    """All that the batch tells; in folders that `folders` names."""
+    """All that the group tells; in folders that `folders` names."""
     return list(train_batch(configs, folders(root, configs), workers=workers, **options))
 
 
@@ -49,30 +56,30 @@ def failures(told: Sequence[tuple[int, Event]]) -> dict[int, str]:
 
 
 @contextmanager
-def at_step(step: int, happens: Callable[[Batch], None]) -> Iterator[None]:
-    """Let something happen when the batch has done exactly so many steps."""
-    real = Batch.step
+def at_step(step: int, happens: Callable[[DeviceEngine], None]) -> Iterator[None]:
+    """Let something happen when the group has done exactly so many steps."""
+    real = DeviceEngine.step
 
-    def step_and_more(batch: Batch, *arguments: object) -> object:
-        result = real(batch, *arguments)
-        if batch.steps == step:
-            happens(batch)
+    def step_and_more(engine: DeviceEngine) -> object:
+        result = real(engine)
+        if engine.steps == step:
+            happens(engine)
         return result
 
-    with mock.patch.object(Batch, "step", step_and_more):
+    with mock.patch.object(DeviceEngine, "step", step_and_more):
         yield
 
 
 def stop_at(step: int, root: Path, configs: Sequence[Config]) -> list[tuple[int, Event]]:
-    """Train until so many steps are done; the batch saves and stops."""
+    """Train until so many steps are done; the group saves and stops."""
     requests = Requests()
-    with at_step(step, lambda batch: setattr(requests, "stop", 1)):
+    with at_step(step, lambda engine: setattr(requests, "stop", 1)):
         return train(root, configs, requests=requests)
 
 
 @contextmanager
 def tiny_environments(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Let the processes of a batch find the environments of `environments/tiny.py`; the prefix of their ids."""
+    """Let the processes of a group find the environments of `environments/tiny.py`; the prefix of their ids."""
     paths = [str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
     yield "environments.tiny:"

@@ -1,4 +1,4 @@
-"""A run of a batch is the run that it would be alone, and none of its business is another's."""
+"""A run of a group is the run that it would be alone, and none of its business is another's."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ import safetensors.numpy
 from environments.tiny import Fragile
 from resume.helpers import assert_same_run, environment_of, without_seconds
 
-from saclab.batch.batch import Batch
+from saclab.batch.engine import DeviceEngine
 from saclab.batch.loop import train_batch
 from saclab.batch.pool import EnvironmentWorkerDied
 from saclab.errors import SettingError, UserError
 from saclab.training import loop, seeds
 from saclab.training.common_checkpoint import checkpoint_steps
-from saclab.training.run import Run
+from saclab.training.local_engine import LocalEngine
 from saclab.training.run_folder import is_finished, read_run
 
-from .helpers import at_step, config, failures, folders, mixed, tiny_environments, train
+from .helpers import at_step, config, engine_of, failures, folders, mixed, tiny_environments, train
 
 
 @pytest.mark.parametrize(
@@ -62,43 +62,44 @@ STEPS_OF_LEARNING = 24
 
 def actions_alone(own):
     """f32[n, A]: the actions of the run alone in its first steps after the random ones."""
-    with closing(Run(own)) as run:
-        while run.counters.steps < own.training.random_steps + STEPS_OF_LEARNING:
-            run.step()
-        return run.replay.layout.unpack(run.replay.rows[own.training.random_steps : run.replay.added]).action
+    with closing(LocalEngine.new(own)) as engine:
+        replay = engine.replay
+        while replay.added < own.training.random_steps + STEPS_OF_LEARNING:
+            engine.step()
+        return replay.layout.unpack(replay.rows[own.training.random_steps : replay.added]).action
 
 
-def test_the_policy_that_acts_is_as_far_behind_as_it_is_alone():
+def test_the_behaviour_parameters_are_as_far_behind_as_they_are_alone():
     """With a learning rate at which each update shows in the actions."""
     fast = {"actor_learning_rate": 0.03, "critic_learning_rate": 0.03, "replay_capacity": 1000}
     expected = {delay: actions_alone(config(acting_delay=delay, **fast)) for delay in (0, 1)}
     assert np.abs(expected[0] - expected[1]).max() > 0.05
     for delay, actions in expected.items():
-        with closing(Batch([config(acting_delay=delay, **fast)], 0, workers=1)) as batch:
-            batch.begin()
-            while batch.steps < 60 + STEPS_OF_LEARNING:
-                batch.step()
-                if batch.steps == 71:
-                    batch.flush()  # as a checkpoint does
-            found = batch.layout.unpack(batch.members[0].replay.rows[60 : batch.steps]).action
+        with closing(engine_of([config(acting_delay=delay, **fast)])) as engine:
+            while engine.steps < 60 + STEPS_OF_LEARNING:
+                engine.step()
+                if engine.steps == 71:
+                    engine.flush()  # as a checkpoint does
+            found = engine.program.layout.unpack(engine.snapshot(0).replay.rows[60 : engine.steps]).action
         np.testing.assert_allclose(found, actions, atol=0.01)
 
 
 def test_transitions_and_draws_of_the_random_steps_are_those_of_the_run_alone():
     configs = [config(seed=seed, parallel_environments=2) for seed in (3, 4, 5)]
-    with closing(Batch(configs, 0, workers=2)) as batch:
-        batch.begin()
+    with closing(engine_of(configs, workers=2)) as group:
         for _ in range(30):
-            batch.step()
-        for member, own in zip(batch.members, configs, strict=True):
-            with closing(Run(own)) as run:
-                while run.counters.steps < batch.steps:
-                    run.step()
-                assert batch.steps == own.training.random_steps
-                np.testing.assert_array_equal(member.replay.rows[: run.replay.size], run.replay.rows[: run.replay.size])
-                np.testing.assert_array_equal(member.observation, run.environments.observation)
-                assert member.exploration.bit_generator.state == run.exploration.bit_generator.state
-                assert member.sampling.bit_generator.state == run.sampling.bit_generator.state
+            group.step()
+        for place, own in enumerate(configs):
+            with closing(LocalEngine.new(own)) as engine:
+                while engine.run.counters.steps < group.steps:
+                    engine.step()
+                assert group.steps == own.training.random_steps
+                ours, theirs = group.snapshot(place), engine.snapshot(0)
+                assert ours.replay.size == theirs.replay.size
+                np.testing.assert_array_equal(ours.replay.rows[: ours.replay.size], theirs.replay.rows[: group.steps])
+                np.testing.assert_array_equal(ours.observation, theirs.observation)
+                assert ours.run.exploration.capture()[0] == theirs.run.exploration.capture()[0]
+                assert ours.run.sampling.bit_generator.state == theirs.run.sampling.bit_generator.state
 
 
 def test_what_the_other_runs_are_changes_no_bit(tmp_path):
@@ -155,8 +156,8 @@ def test_a_run_that_breaks_leaves_the_others_untouched(tmp_path, monkeypatch, ho
         assert ("in step" in story["traceback"]) == (how == "raise")
 
 
-def test_an_environment_that_breaks_in_a_test_ends_its_own_run(tmp_path, monkeypatch):
-    """Which it would do again each time the batch is continued."""
+def test_an_environment_that_breaks_in_an_evaluation_ends_its_own_run(tmp_path, monkeypatch):
+    """Which it would do again each time the group is continued."""
     with tiny_environments(monkeypatch) as prefix:
         told = train(tmp_path, [
             make(config(seed=seed, environment=prefix + "Fragile-v0", evaluation_episodes=1), "raise", broken_at=15)
@@ -166,17 +167,17 @@ def test_an_environment_that_breaks_in_a_test_ends_its_own_run(tmp_path, monkeyp
     assert all("wheels came off" in message for message in failures(told).values())
 
 
-def spoil_critic(batch, slot):
-    critic = batch.state.critic
-    batch.state = batch.state._replace(critic=critic._replace(weights=critic.weights.at[slot].set(np.nan)))
+def spoil_critic(engine, run):
+    critic = engine.state.critic
+    engine.state = engine.state._replace(critic=critic._replace(weights=critic.weights.at[run].set(np.nan)))
 
 
 def test_a_learner_that_is_not_finite_at_the_last_save_ends_its_own_run(tmp_path):
     configs = mixed()
 
-    def spoil(batch):
-        batch.flush()
-        spoil_critic(batch, 1)
+    def spoil(engine):
+        engine.flush()
+        spoil_critic(engine, 1)
 
     with at_step(240, spoil):
         told = train(tmp_path, configs)
@@ -186,15 +187,15 @@ def test_a_learner_that_is_not_finite_at_the_last_save_ends_its_own_run(tmp_path
 
 
 def test_a_run_whose_update_breaks_is_told_of_the_update(tmp_path):
-    real = Batch._advance
+    real = DeviceEngine._advance
 
-    def breaking(batch, updates, packed):
-        real(batch, updates, packed)
-        if batch.steps == 102:
-            spoil_critic(batch, 2)
+    def breaking(engine, updates, packed):
+        real(engine, updates, packed)
+        if engine.steps == 102:
+            spoil_critic(engine, 2)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Batch, "_advance", breaking)
+        patch.setattr(DeviceEngine, "_advance", breaking)
         told = train(tmp_path, mixed())
     assert failures(told).keys() == {2}
     assert "gave a value that is not finite in critic_loss" in failures(told)[2]
@@ -244,6 +245,24 @@ def test_runs_are_spread_over_devices(tmp_path, devices):
 def test_replay_buffers_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(SettingError, match=r"in each of 3 runs at once.*or a smaller --batch"):
         train(tmp_path, mixed(replay_capacity=10**11))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"activation": "tanh"}, "activation, and it is 'relu' in the first and 'tanh' in number 3"),
+        ({"hidden_layers": (16, 8)}, "hidden_layers"),
+        ({"snapshots": 2}, "snapshots"),
+        ({"parallel_environments": 2}, "parallel_environments"),
+        ({"max_updates": 17}, "max_updates"),
+        ({"environment": "MountainCarContinuous-v0"}, "environment"),
+    ],
+)
+def test_runs_of_different_structure_are_refused_before_anything_is_written(tmp_path, changes, named):
+    """Otherwise the first one's setting would be used for all of them, in silence."""
+    with pytest.raises(UserError, match=rf"must agree in {named}"):
+        train(tmp_path, [config(seed=0), config(seed=1, discount=0.5), config(seed=2, **changes)])
     assert list(tmp_path.iterdir()) == []
 
 

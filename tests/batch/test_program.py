@@ -1,4 +1,4 @@
-"""What a batch computes is what each of its runs would compute alone."""
+"""What a run group computes is what each of its runs would compute alone."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import pytest
 
 from saclab.algorithm.scalars import scalars
 from saclab.algorithm.types import Context
-from saclab.batch.program import Arrival, Program
-from saclab.config import structure
+from saclab.batch.program import Program, StepInputs
 from saclab.replay import RowLayout
+from saclab.settings import structure
 from saclab.training import seeds
-from saclab.training.course import named_leaves
-from saclab.training.run import compiled_init, compiled_update
+from saclab.training.learners import compiled_init, compiled_update, named_leaves
 
 from .helpers import config, mixed
 
@@ -32,8 +31,7 @@ def test_each_slot_is_updated_by_its_own_numbers(snapshots):
     settings = [each.algorithm for each in mixed(snapshots=snapshots, batch_size=16)]
     settings.append(config(snapshots=snapshots, batch_size=16, snapshot_interval=4, temperature="fixed",
                            initial_temperature=0.0).algorithm)  # fmt: skip
-    numbers = [scalars(each, 2) for each in settings]
-    shape = structure(settings[0])
+    numbers, shape = [scalars(each, 2) for each in settings], structure(settings[0])
     init, update = compiled_init(shape, LAYOUT), compiled_update(shape, LAYOUT)
     states = [init(own, seeds.learner_key(run)) for run, own in enumerate(numbers)]
     random = np.random.default_rng(0)
@@ -45,7 +43,7 @@ def test_each_slot_is_updated_by_its_own_numbers(snapshots):
     before = rows.copy()
     before[:, [CAPACITY - 1, 0]] = 0
     position = np.full(len(settings), CAPACITY - 1, np.int32)
-    packed = program.arrival(5).pack(len(settings), rows=newest, position=position, drawn=drawn)
+    packed = program.inputs(5).pack(len(settings), rows=newest, position=position, drawn=drawn)
     state, replay, metrics = program.advance(
         5, stacked(numbers), program.put(stacked(states)), program.put(before), program.put(packed),
         Context(np.int32(0), np.ones((len(settings), 1), np.float32), np.ones(len(settings), np.float32)),
@@ -72,16 +70,16 @@ def test_actions_are_those_of_each_runs_policy():
     random = np.random.default_rng(1)
     observation = random.standard_normal((3, 4, 3)).astype(np.float32)
     noise = random.standard_normal((3, 4, 2)).astype(np.float32)
-    packed = program.arrival(1).pack(3, observation=observation, noise=noise)
+    packed = program.inputs(1).pack(3, observation=observation, noise=noise)
     action = program.act(stacked(actors), packed)
     for run, actor in enumerate(actors):
         expected = program.learner.policy.act(np.asarray(actor), observation[run], noise[run])
         np.testing.assert_allclose(action[run], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_what_arrives_is_taken_apart_bit_for_bit():
+def test_the_inputs_of_a_step_are_taken_apart_bit_for_bit():
     """Also numbers that are no normal floating-point numbers, and whole numbers, whose bits are tiny ones."""
-    arrival = Arrival(LAYOUT, environments=2, updates=3, batch_size=4)
+    inputs = StepInputs(LAYOUT, environments=2, updates=3, batch_size=4)
     parts = {
         "observation": np.array([[[np.nan, -0.0, 1e-42], [1, 2, 3]]], np.float32),
         "noise": np.arange(4, dtype=np.float32).reshape(1, 2, 2),
@@ -89,11 +87,11 @@ def test_what_arrives_is_taken_apart_bit_for_bit():
         "position": np.array([7], np.int32),
         "drawn": np.arange(12, dtype=np.int32).reshape(1, 3, 4),
     }
-    packed = arrival.pack(2, **parts)
+    packed = inputs.pack(2, **parts)
     assert packed.shape == (2, 6 + 4 + 2 * LAYOUT.width + 1 + 12)
     assert (packed[1] == 0).all()
     for name, part in parts.items():
-        found = np.asarray(jax.jit(lambda slot, name=name: arrival.unpack(slot, name))(jnp.asarray(packed[0])))
+        found = np.asarray(jax.jit(lambda slot, name=name: inputs.unpack(slot, name))(jnp.asarray(packed[0])))
         assert found.dtype == part.dtype
         assert found.tobytes() == part[0].tobytes(), name
 

@@ -1,4 +1,4 @@
-"""A batch that was stopped, killed or broken off at any moment goes on as if nothing had been."""
+"""A run group that was stopped, killed or broken off at any moment goes on as if nothing had been."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from contextlib import closing
 import pytest
 from resume.helpers import assert_same_run
 
-from saclab.batch.batch import Batch
+from saclab.batch.engine import DeviceEngine
 from saclab.batch.loop import train_batch
 from saclab.batch.pool import EnvironmentWorkerDied
-from saclab.training import loop
+from saclab.training import checkpoint, loop
 from saclab.training.checkpoint import CheckpointError
 from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
 from saclab.training.events import Evaluated, Interrupted, Saved, UpdatesLogged
@@ -36,6 +36,23 @@ def test_a_stopped_batch_goes_on_bit_for_bit(tmp_path, environment, stop):
         assert_same_run(straight, stopped)
 
 
+def test_a_group_that_goes_on_reads_each_file_of_its_checkpoints_once(tmp_path, monkeypatch):
+    """A replay buffer may have gigabytes."""
+    configs, reads, real = mixed(), [], checkpoint.read_arrays
+    monkeypatch.setattr(checkpoint, "SEGMENT_ROWS", 40)
+    stop_at(150, tmp_path, configs)
+
+    def read_arrays(folder, name, entry):
+        reads.append((folder.parent.parent.name, name))
+        return real(folder, name, entry)
+
+    monkeypatch.setattr(checkpoint, "read_arrays", read_arrays)
+    with closing(train_batch(configs, folders(tmp_path, configs), workers=1)) as events:
+        assert next(events)[1].resumed_at_step == 150
+    assert len(reads) == len(set(reads))
+    assert {("run-0", "replay-0003.safetensors"), ("run-2", "learner.safetensors")} < set(reads)
+
+
 @pytest.mark.slow
 def test_saving_changes_nothing(tmp_path):
     """A checkpoint brings the devices up to date before the next step would."""
@@ -46,19 +63,19 @@ def test_saving_changes_nothing(tmp_path):
     assert_same_run(tmp_path / "straight/run-2", tmp_path / "saved/run-2")
 
 
-def test_a_stop_in_the_middle_of_a_test_leaves_the_test_to_be_made(tmp_path):
+def test_a_stop_in_the_middle_of_an_evaluation_leaves_it_to_be_made(tmp_path):
     configs = mixed()
     train(tmp_path / "straight", configs)
     requests = Requests()
     events = train_batch(configs, folders(tmp_path / "stopped", configs), requests, workers=2)
-    real = Batch.test
+    real = DeviceEngine.evaluate
 
-    def ask_and_test(batch, members, asked_to_stop):
+    def ask_and_evaluate(engine, runs, should_stop):
         requests.stop = 1
-        return real(batch, members, asked_to_stop)
+        return real(engine, runs, should_stop)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Batch, "test", ask_and_test)
+        patch.setattr(DeviceEngine, "evaluate", ask_and_evaluate)
         told = list(events)
     assert isinstance(told[-1][1], Interrupted)
     assert not any(isinstance(event, Evaluated) for _, event in told)
@@ -104,7 +121,7 @@ def test_a_batch_whose_process_is_killed_goes_on_bit_for_bit(tmp_path):
     configs = mixed()
     train(tmp_path / "straight", configs)
     with (
-        at_step(121, lambda batch: batch.pool.workers[0].process.kill()),
+        at_step(121, lambda engine: engine.pool.workers[0].process.kill()),
         pytest.raises(EnvironmentWorkerDied, match="killed by SIGKILL"),
     ):
         train(tmp_path / "killed", configs, checkpoint_minutes=0.001)

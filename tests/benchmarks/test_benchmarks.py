@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from saclab.config import AlgorithmSettings
 from saclab.replay import RowLayout
+from saclab.settings import AlgorithmSettings
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import tables

@@ -6,8 +6,8 @@ import pytest
 
 from saclab.cli.main import parse
 from saclab.cli.settings import docstrings, named_config
-from saclab.config import AlgorithmSettings, TrainingSettings, field_names
 from saclab.errors import UserError
+from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
 
 def settings_of(*words: str) -> dict[str, object]:

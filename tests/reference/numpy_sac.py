@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 """Weights [inputs, outputs] and bias [outputs] of each layer."""

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from saclab.algorithm.learner import metric_names
-from saclab.config import AlgorithmSettings
 from saclab.protocols import make_config
+from saclab.settings import AlgorithmSettings
 from saclab.training.run_folder import EPISODE_COLUMNS, FORMAT, Q_BIAS_COLUMNS, evaluation_columns, run_path
 
 VERSIONS = {"saclab": "0.1.0", "jax": "0.10.2", "gymnasium": "1.4.0", "mujoco": "4.0.0", "python": "3.11.9"}

@@ -16,13 +16,13 @@ from pathlib import Path
 from unittest import mock
 
 from saclab.config import Config
-from saclab.environments.vector import EndedEpisode
 from saclab.protocols import make_config
 from saclab.training import loop
 from saclab.training.checkpoint import newest_first, read_manifest
+from saclab.training.engine import StepResult
 from saclab.training.events import Event, Finished, Interrupted, Saved, UpdatesLogged
+from saclab.training.local_engine import LocalEngine
 from saclab.training.requests import Requests
-from saclab.training.run import Run
 
 STEPS = 240
 SMALL = {
@@ -53,15 +53,15 @@ def finish(config: Config, folder: Path) -> list[Event]:
 @contextmanager
 def request_at(step: int, requests: Requests, what: str) -> Iterator[None]:
     """Let the request come when the run has done exactly so many steps, as no signal could."""
-    real = Run.step
+    real = LocalEngine.step
 
-    def step_and_ask(run: Run) -> list[EndedEpisode]:
-        ended = real(run)
-        if run.counters.steps == step:
+    def step_and_ask(engine: LocalEngine) -> StepResult:
+        result = real(engine)
+        if engine.run.counters.steps == step:
             setattr(requests, what, True)
-        return ended
+        return result
 
-    with mock.patch.object(Run, "step", step_and_ask):
+    with mock.patch.object(LocalEngine, "step", step_and_ask):
         yield
 
 

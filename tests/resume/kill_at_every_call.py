@@ -18,7 +18,8 @@ import numpy as np
 from saclab.environments.vector import Transitions
 from saclab.replay import ReplayBuffer, RowLayout
 from saclab.training import checkpoint as checkpoints
-from saclab.training.checkpoint import Checkpoint, load_newest_checkpoint, save_checkpoint
+from saclab.training.checkpoint import Checkpoint, save_checkpoint
+from saclab.training.common_checkpoint import load_newest_checkpoint
 
 LAYOUT, CAPACITY = RowLayout(2, 1), 40
 CALLS = ("open", "mkdir", "rename", "replace", "link", "unlink", "rmdir", "fsync", "close", "scandir", "stat")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import safetensors.numpy
@@ -13,7 +12,6 @@ import safetensors.numpy
 from saclab.training import loop
 from saclab.training.checkpoint import newest_first
 from saclab.training.events import Started
-from saclab.training.run import Run
 
 from .helpers import finish, small_config, stop_at
 
@@ -21,7 +19,7 @@ FIRST, SECOND = 100, 130
 
 
 class Stage:
-    """A run with checkpoints at FIRST and SECOND, copied for each test; one `Run` in memory serves them all."""
+    """A run with checkpoints at FIRST and SECOND, copied for each test."""
 
     def __init__(self, folder: Path) -> None:
         self.config = small_config("Pendulum-v1", environments=2, max_steps=150)
@@ -29,14 +27,12 @@ class Stage:
         finish(self.config, self.straight)
         stop_at(FIRST, self.config, self.saved)
         stop_at(SECOND, self.config, self.saved)
-        self.run = Run(self.config)
 
     def continue_from(self, folder: Path) -> Started:
         """What a session tells as it begins; no step is made."""
-        with mock.patch.object(loop, "Run", return_value=self.run), mock.patch.object(self.run, "close"):
-            events = loop.train(self.config, folder)
-            started = next(events)
-            events.close()
+        events = loop.train(self.config, folder)
+        started = next(events)
+        events.close()
         assert isinstance(started, Started)
         return started
 

@@ -17,11 +17,13 @@ from environments import tiny  # noqa: F401 - registers them
 from saclab import replay
 from saclab.errors import NonFiniteError, SettingError, TrainingFailed
 from saclab.protocols import make_config
-from saclab.training import checkpoint, journal, loop
+from saclab.training import checkpoint, failure, loop, run_writer
 from saclab.training.checkpoint import newest_first, read_manifest
+from saclab.training.common_checkpoint import load_newest_checkpoint
 from saclab.training.events import Warned
+from saclab.training.local_engine import LocalBuilder, LocalEngine
 from saclab.training.requests import Requests
-from saclab.training.run import Run
+from saclab.training.snapshot import to_checkpoint
 
 from .helpers import environment_of, request_at, small_config, vanish_after
 
@@ -60,22 +62,22 @@ def test_an_environment_that_breaks_stops_the_run_with_its_step(tmp_path, what):
 @pytest.mark.parametrize("field", ["critic_loss", "temperature"])
 def test_an_update_that_breaks_is_named_and_the_environment_is_not_blamed(tmp_path, monkeypatch, field):
     """The policy that came of it would give the environment actions that are not finite."""
-    real = Run.__init__
+    real = LocalEngine.__init__
 
-    def init(run, config):
-        real(run, config)
-        update = run.update
+    def init(engine, start, replay):
+        real(engine, start, replay)
+        update = engine.update
 
         def breaking(numbers, state, rows, context):
             state, metrics = update(numbers, state, rows, context)
-            if run.counters.updates == 9:
-                metrics = metrics.at[run.metrics.index(field)].set(jnp.nan)
+            if engine.run.counters.updates == 9:
+                metrics = metrics.at[engine.run.metrics.index(field)].set(jnp.nan)
                 state = state._replace(actor=state.actor._replace(weights=state.actor.weights * jnp.nan))
             return state, metrics
 
-        run.update = breaking
+        engine.update = breaking
 
-    monkeypatch.setattr(Run, "__init__", init)
+    monkeypatch.setattr(LocalEngine, "__init__", init)
     config = small_config("Pendulum-v1", log_interval=100)
     message, story, arrays = broken(config, tmp_path, steps_saved=70)
     assert f"update 10 gave a value that is not finite in {field}: lower the learning rates" in message
@@ -86,19 +88,20 @@ def test_an_update_that_breaks_is_named_and_the_environment_is_not_blamed(tmp_pa
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_learner_that_is_not_finite_is_not_saved(tmp_path, value):
-    run = Run(small_config("Pendulum-v1"))
-    critic = run.learner_state.critic
+    engine = LocalEngine.new(small_config("Pendulum-v1"))
+    critic = engine.learner_state.critic
     broken_critic = critic._replace(weights=critic.weights.at[0, 0].set(value))
-    run.learner_state = run.learner_state._replace(critic=broken_critic)
+    engine.learner_state = engine.learner_state._replace(critic=broken_critic)
     with pytest.raises(NonFiniteError, match=r"\.critic\.weights is not finite"):
-        run.capture()
-    run.close()
+        to_checkpoint(engine.snapshot(0), engine.capture_environments(0))
+    engine.close()
 
 
 def test_a_fixed_temperature_of_zero_has_a_logarithm_that_is_saved():
-    run = Run(small_config("Pendulum-v1", "sac", initial_temperature=0.0))
-    assert np.isneginf(run.capture().groups["learner"][".temperature.weights"])
-    run.close()
+    engine = LocalEngine.new(small_config("Pendulum-v1", "sac", initial_temperature=0.0))
+    saved = to_checkpoint(engine.snapshot(0), engine.capture_environments(0))
+    assert np.isneginf(saved.groups["learner"][".temperature.weights"])
+    engine.close()
 
 
 @pytest.mark.parametrize(
@@ -106,13 +109,13 @@ def test_a_fixed_temperature_of_zero_has_a_logarithm_that_is_saved():
     [
         ((1e-5, 0.9), ["cannot reach the target entropy: lower --target-entropy"]),
         ((1.1, 100.0), ["raise --target-entropy"]),
-        (journal.SANE_TEMPERATURES, []),
+        (run_writer.SANE_TEMPERATURES, []),
     ],
     ids=["exploding", "collapsing", "sane"],
 )
 def test_a_runaway_temperature_is_told_once_with_advice(tmp_path, monkeypatch, sane, advice):
     """The temperature begins at 1 and stays near it for so few updates."""
-    monkeypatch.setattr(journal, "SANE_TEMPERATURES", sane)
+    monkeypatch.setattr(run_writer, "SANE_TEMPERATURES", sane)
     config = small_config("Pendulum-v1", max_steps=110, evaluation_interval_steps=1_000)
     told = [event.message for event in loop.train(config, tmp_path) if isinstance(event, Warned)]
     assert len(told) == len(advice)
@@ -122,11 +125,7 @@ def test_a_runaway_temperature_is_told_once_with_advice(tmp_path, monkeypatch, s
 @pytest.mark.parametrize("temperature", [1e-9, 1.0, 1e9])
 def test_a_fixed_temperature_is_no_news(temperature):
     session = SimpleNamespace(warned_of_temperature=False, run=SimpleNamespace(config=small_config("Any-v0", "sac")))
-    assert list(journal.Journal._watch_temperature(session, temperature)) == []
-
-
-def test_the_bounds_of_a_sane_temperature():
-    assert journal.SANE_TEMPERATURES == (1e-5, 100.0)
+    assert list(run_writer.RunWriter._watch_temperature(session, temperature)) == []
 
 
 # --- memory
@@ -186,8 +185,8 @@ def test_a_disk_that_fills_up_while_logs_are_written_is_told(tmp_path, monkeypat
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(journal.Logs, "metrics", full)
-    monkeypatch.setattr(journal.Logs, "close", full)
+    monkeypatch.setattr(run_writer.Logs, "metrics", full)
+    monkeypatch.setattr(run_writer.Logs, "close", full)
     with pytest.raises(TrainingFailed, match=r"No space left on device; what was saved is kept: make room.*resume"):
         list(loop.train(config, tmp_path))
     assert newest_first(tmp_path / "checkpoints") == kept
@@ -203,7 +202,7 @@ def test_a_full_disk_does_not_hide_the_number_that_broke_the_run(tmp_path, monke
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(journal, "write_failure", full)
+    monkeypatch.setattr(failure, "replace_file", full)
     arguments = {"broken_at": 3, "broken": "reward"}
     config = make_config("Counting-v0", "sac", environment_arguments=arguments, overrides={
         "hidden_layers": (8,), "batch_size": 4, "random_steps": 12, "max_steps": 60, "evaluation_interval_steps": 100,
@@ -219,6 +218,5 @@ def test_a_file_system_without_links_gets_whole_files(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint.os, "link", no_links)
     config = small_config("Pendulum-v1", random_steps=32, max_steps=34)
     list(loop.train(config, tmp_path, checkpoint_minutes=0))
-    run = Run(config)
-    assert checkpoint.load_newest_checkpoint(tmp_path / "checkpoints", run.replay, pytest.fail) is not None
-    run.close()
+    replay = LocalBuilder(config).replay
+    assert load_newest_checkpoint(tmp_path / "checkpoints", replay, pytest.fail) is not None

@@ -19,7 +19,7 @@ from saclab.environments.make import make_environment
 from saclab.environments.simulator import capture_mujoco, capture_state, restore_mujoco
 from saclab.errors import UserError
 from saclab.machine import machine_facts, visible_threads
-from saclab.training import loop
+from saclab.training import local_engine, loop
 from saclab.training.checkpoint import CheckpointError, newest_first
 from saclab.training.events import Saved, Started, Warned
 from saclab.training.lock import locked
@@ -161,14 +161,15 @@ def test_an_environment_that_cannot_be_captured_starts_a_new_episode_which_is_to
 def test_its_new_episode_is_not_the_first_one_again(tmp_path, monkeypatch):
     """Otherwise a run that is stopped often would see the same start over and over."""
     config = small_config("Counting-v0", environments=2, hidden_layers=(8,))
-    starts, real = [], loop.Run.restore
+    starts, real = [], local_engine.restored_environments
 
-    def restore(run, saved):
-        restarted = real(run, saved)
-        starts.append(run.environments.observation[:, 2].tolist())
-        return restarted
+    def restored(start):
+        environments = real(start)
+        if start.environments is not None:
+            starts.append(environments.observation[:, 2].tolist())
+        return environments
 
-    monkeypatch.setattr(loop.Run, "restore", restore)
+    monkeypatch.setattr(local_engine, "restored_environments", restored)
     for step in (62, 64, 66, 68):
         stop_at(step, config, tmp_path)
     numbers = [number for start in starts for number in start]

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from saclab.training.checkpoint import newest_first, read_checkpoint
-from saclab.training.run import Run
+from saclab.training.local_engine import LocalBuilder
 from saclab.training.run_folder import read_config
 
 from .helpers import assert_same_run, kill, run, settings, start, wait_for
 
-# Tests of twenty episodes are under way most of the time: no one should have to wait for their end.
+# Evaluations of twenty episodes are under way most of the time: no one should have to wait for their end.
 LONG = tuple(settings(
     max_steps=50_000_000, replay_capacity=2_000, evaluation_episodes=20, evaluation_interval_steps=50
 ))  # fmt: skip
@@ -23,7 +23,7 @@ WITHIN_SECONDS = 15  # one or two, unless the machine is busy
 
 
 def started(folder: Path):
-    """A process that has begun to test its policy."""
+    """A process that has begun to evaluate its policy."""
     process = start(folder, "train", "Pendulum-v1", *LONG)
     wait_for(lambda: (folder / RUN / "evaluations.csv").exists() or process.poll() is not None)
     wait_for(lambda: len((folder / RUN / "evaluations.csv").read_text().splitlines()) > 2)
@@ -31,9 +31,8 @@ def started(folder: Path):
 
 
 def assert_whole(folder: Path) -> None:
-    newest = Run(read_config(folder / RUN))
-    assert read_checkpoint(newest_first(folder / RUN / "checkpoints")[0], newest.replay)
-    newest.close()
+    replay = LocalBuilder(read_config(folder / RUN)).replay
+    assert read_checkpoint(newest_first(folder / RUN / "checkpoints")[0], replay)
 
 
 @pytest.mark.slow

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from saclab.training import checkpoint, loop
+from saclab.training import checkpoint, loop, starts
 from saclab.training.checkpoint import newest_first, read_manifest
 from saclab.training.events import Evaluated, Interrupted, Started
+from saclab.training.local_engine import LocalEngine
 from saclab.training.requests import Requests
-from saclab.training.run import Run
 from saclab.variants import VARIANTS
 
 from .helpers import STEPS, assert_same_run, finish, lines_of, request_at, small_config, stop_at, vanish_after
@@ -67,31 +67,31 @@ def test_three_environments_continue_exactly(straight, tmp_path):
 
 
 @pytest.mark.parametrize("calls", [0, 5], ids=["before its first step", "after some steps"])
-@pytest.mark.parametrize("test", ["first", "last"])
-def test_a_test_is_broken_off_on_request_and_made_anew(straight, tmp_path, calls, test):
-    """A test of twenty long episodes takes longer than anyone who sends SIGTERM waits."""
+@pytest.mark.parametrize("which", ["first", "last"])
+def test_an_evaluation_is_broken_off_on_request_and_made_anew(straight, tmp_path, calls, which):
+    """An evaluation of twenty long episodes takes longer than anyone who sends SIGTERM waits."""
     config, folder, events = straight
-    tests = [event for event in events if isinstance(event, Evaluated)]
-    begun_at = tests[0 if test == "first" else -1].steps
-    requests, real, seen = Requests(), Run.evaluate, []
+    evaluations = [event for event in events if isinstance(event, Evaluated)]
+    begun_at = evaluations[0 if which == "first" else -1].steps
+    requests, real, seen = Requests(), LocalEngine.evaluate, []
 
-    def evaluate(run, asked_to_stop):
+    def evaluate(engine, runs, should_stop):
         def asked():
-            seen.append(run.counters.steps)
+            seen.append(engine.run.counters.steps)
             if len([step for step in seen if step == begun_at]) > calls:
                 requests.stop = 15
-            return asked_to_stop()
+            return should_stop()
 
-        return real(run, asked)
+        return real(engine, runs, asked)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Run, "evaluate", evaluate)
+        patch.setattr(LocalEngine, "evaluate", evaluate)
         assert list(loop.train(config, tmp_path, requests))[-1] == Interrupted(begun_at)
     assert len([step for step in seen if step == begun_at]) == calls + 1
     resumed = finish(config, tmp_path)
     assert resumed[0].resumed_at_step == begun_at
     assert [event.steps for event in resumed if isinstance(event, Evaluated)] == [
-        event.steps for event in tests if event.steps >= begun_at
+        event.steps for event in evaluations if event.steps >= begun_at
     ]
     assert_same_run(folder, tmp_path)
 
@@ -124,17 +124,16 @@ def test_a_request_to_save_changes_nothing(straight, tmp_path):
 def test_the_comparison_sees_one_changed_bit(straight, tmp_path):
     config, folder, _ = straight
     stop_at(HALF, config, tmp_path)
-    real = Run.restore
+    real = starts.from_checkpoint
 
-    def restore(run, saved):
-        restarted = real(run, saved)
-        actor = np.array(run.learner_state.actor.weights)
+    def from_checkpoint(*arguments):
+        start = real(*arguments)
+        actor = np.array(start.learner.actor.weights)
         actor[0] = np.nextafter(actor[0], np.float32(math.inf))
-        run.learner_state = run.learner_state._replace(actor=run.learner_state.actor._replace(weights=actor))
-        return restarted
+        return start._replace(learner=start.learner._replace(actor=start.learner.actor._replace(weights=actor)))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Run, "restore", restore)
+        patch.setattr(starts, "from_checkpoint", from_checkpoint)
         finish(config, tmp_path)
     with pytest.raises(AssertionError):
         assert_same_run(folder, tmp_path)

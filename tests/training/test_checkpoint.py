@@ -15,10 +15,10 @@ from saclab.training import checkpoint as checkpoints
 from saclab.training.checkpoint import (
     Checkpoint,
     CheckpointError,
-    load_newest_checkpoint,
     newest_first,
     save_checkpoint,
 )
+from saclab.training.common_checkpoint import load_newest_checkpoint
 
 LAYOUT = RowLayout(2, 1)
 CAPACITY = 50  # not a multiple of the segments' length

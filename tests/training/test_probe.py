@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 
 import numpy as np
 import pytest
 from environments import tiny
 
 from saclab.protocols import make_config
-from saclab.training.run import Run
+from saclab.training.local_engine import LocalEngine
 
 DISCOUNT, ALPHA, REWARD = 0.6, 0.5, 2.0
 SETTINGS = {
@@ -39,12 +40,12 @@ def test_a_constant_reward_is_worth_itself_before_a_terminal_state_and_all_its_f
     terminal, worth
 ):
     assert tiny.TIME_LIMIT == 5
-    run = Run(make_config("Constant-v0", "sac", environment_arguments={"terminal": terminal}, overrides=SETTINGS))
+    config = make_config("Constant-v0", "sac", environment_arguments={"terminal": terminal}, overrides=SETTINGS)
     ends = []
-    while run.finish_reason() is None:
-        ends += run.step()
-    run.close()
+    with closing(LocalEngine.new(config)) as engine:
+        while engine.run.finish_reason() is None:
+            ends += engine.step().ended.get(0, [])
     assert {episode.terminated for episode in ends} == {terminal}
-    critics = np.asarray(run.learner_state.critic.weights)
-    values = [run.q_values(critic, np.array([1.0, 0.3], np.float32)) for critic in critics]
+    critics = np.asarray(engine.learner_state.critic.weights)
+    values = [engine.learner.q_values(critic, np.array([1.0, 0.3], np.float32)) for critic in critics]
     assert values == pytest.approx([worth, worth], abs=0.1)

@@ -12,9 +12,11 @@ import pytest
 
 from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import scalars
-from saclab.config import AlgorithmSettings
+from saclab.batch.loop import train_batch
+from saclab.config import Config
 from saclab.environments.make import environment_spec, make_environment
 from saclab.protocols import make_config
+from saclab.settings import AlgorithmSettings
 from saclab.training.loop import train
 from saclab.training.q_bias import Critics, Episode, QBias, known_returns, measure_q_bias
 from saclab.training.run_folder import Q_BIAS_COLUMNS, read_run
@@ -43,16 +45,16 @@ def test_steps_near_a_time_limit_are_left_out() -> None:
     assert len(known_returns(episode([1.0] * 5, [0.0] * 5, terminated=True), 0.1, 0.5)) == 5
 
 
-def pendulum_bias(discount: float, shift: float) -> QBias:
-    """The bias of random critics whose output bias is moved by `shift`."""
+def pendulum_bias(discount: float, shift: float, reduction: str = "minimum", critics_moved: int = 2) -> QBias:
+    """The bias of random critics, of some of which the output's bias is moved by `shift`."""
     settings = AlgorithmSettings(hidden_layers=(8,), discount=discount)
     environment = make_environment("Pendulum-v1")
     spec = environment_spec("Pendulum-v1", environment)
     learner = make_learner(settings, spec.observation_size, spec.action_size)
     state = learner.init(scalars(settings, spec.action_size), jax.random.PRNGKey(0))
     critic = np.array(state.critic.weights)
-    critic[:, -1] += shift  # the last parameter is the output's bias
-    critics = Critics(learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount)
+    critic[:critics_moved, -1] += shift  # the last parameter is the output's bias
+    critics = Critics(learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount, reduction)
     return measure_q_bias(critics, environment, spec, [1, 2], np.random.default_rng(0))
 
 
@@ -61,6 +63,36 @@ def test_moving_q_moves_the_bias_by_as_much_over_the_mean_return() -> None:
     assert high.mean_q - low.mean_q == pytest.approx(3.0, rel=1e-4)
     assert high.mean_bias - low.mean_bias == pytest.approx(3.0 / abs(low.mean_return), rel=1e-4)
     assert high.bias_spread == pytest.approx(low.bias_spread, rel=1e-3)
+
+
+def test_the_critics_are_reduced_as_the_policy_reduces_them() -> None:
+    """Far above the other, one of two critics does not count in a minimum, and half in a mean."""
+    by_minimum, by_mean = (
+        [pendulum_bias(0.9, shift, reduction, critics_moved=1).mean_q for shift in (100.0, 110.0)]
+        for reduction in ("minimum", "mean")
+    )
+    assert by_minimum[1] == by_minimum[0]
+    assert by_mean[1] - by_mean[0] == pytest.approx(5.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a group"])
+def test_the_logged_bias_takes_the_reduction_of_the_settings(tmp_path: Path, together: bool) -> None:
+    """Two runs that differ in it and have made no update: they have the same critics, which do not agree."""
+    mean_q = []
+    for reduction in ("minimum", "mean"):
+        config, folder = judged_config(actor_reduction=reduction), tmp_path / reduction
+        for _ in train_batch([config], [folder], workers=1) if together else train(config, folder):
+            pass
+        mean_q.append(read_run(folder).q_bias["mean_q"][0])
+    assert mean_q[0] < mean_q[1]
+
+
+def judged_config(**changes: object) -> Config:
+    """Its only evaluation comes before its first update."""
+    return make_config("Pendulum-v1", "sac", "quick", overrides={
+        "hidden_layers": (8,), "batch_size": 16, "random_steps": 100, "max_steps": 100, "discount": 0.9,
+        "evaluation_interval_steps": 200, "evaluation_episodes": 1, "q_bias_episodes": 1, **changes,
+    })  # fmt: skip
 
 
 def test_no_known_return_gives_nan_and_no_pairs() -> None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from saclab.algorithm.networks.network import Array
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 
 class CriticHead(NamedTuple):

@@ -18,7 +18,7 @@ from saclab.algorithm.policy import Policy, make_policy
 from saclab.algorithm.scalars import Scalars
 from saclab.algorithm.targets import REDUCTIONS, averaged_entropy, averaged_prediction, polyak_update
 from saclab.algorithm.types import Batch, Context, LearnerState
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 METRICS = {
     "critic_loss": "The loss of the critics' head (Eq. 3), summed over the critics.",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from saclab.algorithm.networks import NETWORKS
 from saclab.algorithm.networks.network import Array, Network
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 
 class Policy(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from saclab.config import AlgorithmSettings
+from saclab.settings import AlgorithmSettings
 
 Scalars = dict[str, Any]
 """Name of a setting -> f32[] or i32[], NumPy or JAX; [R] where runs are mapped over."""

@@ -30,9 +30,9 @@ class Context(NamedTuple):
 
     step: jax.Array | np.int32
     """i32[]: updates made before. Runs that are mapped over share it, so that a period is a branch, not a choice."""
-    reward_weights: jax.Array
+    reward_weights: jax.Array | np.ndarray
     """f32[T]."""
-    reward_scale: jax.Array
+    reward_scale: jax.Array | np.float32
     """f32[]: rewards are divided by it."""
 
 

@@ -1,1 +1,1 @@
-"""Many runs of the same structure as one program: replay and learners on the device, environments in processes."""
+"""The device engine: many runs of one structure as one program, with their environments in processes."""

@@ -1,4 +1,4 @@
-"""The processes that step the environments of a batch, from the batch's side."""
+"""The processes that step the environments of a run group, from the engine's side."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from typing import Any
 import numpy as np
 
 from saclab.batch import frames
-from saclab.batch.board import Board, Sizes
 from saclab.batch.frames import Arrays, Message
+from saclab.batch.shared_buffers import SharedBuffers, Sizes
 from saclab.batch.worker import DONE, MESSAGE, STEP
 from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed, UserError
+from saclab.replay import layout_of
 from saclab.training import seeds
 from saclab.training.captured import join_arrays, split_arrays
-from saclab.training.checkpoint import CheckpointError
+from saclab.training.engine import EnvironmentStateError
 from saclab.training.requests import Stopped
 
 POLL_SECONDS = 0.1
@@ -45,15 +46,15 @@ class EnvironmentPool:
         """
         self.environments = configs[0].training.parallel_environments
         self.spec = spec
-        self.board = Board(Sizes(len(configs), self.environments, spec.observation_size, spec.action_size))
-        self.board.active[:] = True
+        self.buffers = SharedBuffers(Sizes(len(configs), self.environments, layout_of(spec, configs[0].algorithm)))
+        self.buffers.active[:] = True
         self.workers: list[PoolWorker] = []
         try:
-            parts = [part for part in np.array_split(np.arange(len(self.board.row)), workers) if len(part)]
+            parts = [part for part in np.array_split(np.arange(len(self.buffers.row)), workers) if len(part)]
             for part in parts:  # all of them start before the first is waited for
-                self.workers.append(PoolWorker(self.board, part // self.environments))
+                self.workers.append(PoolWorker(self.buffers, part // self.environments))
             for worker, part in zip(self.workers, parts, strict=True):
-                worker.make_environments(configs, int(part[0]), self.board)
+                worker.make_environments(configs, int(part[0]), self.buffers)
             for worker in self.workers:
                 reply, _ = worker.receive()
                 if "user_error" in reply:
@@ -65,12 +66,12 @@ class EnvironmentPool:
     def step(self, action: np.ndarray) -> dict[int, RunBroken]:
         """Apply f32[N, A] in [-1, 1] in every active run; run -> what ended it.
 
-        The transitions, observations and ended episodes are on the board then.
+        The transitions, observations and ended episodes are in the shared buffers then.
 
         Raises:
             EnvironmentWorkerDied: if a process is gone.
         """
-        self.board.action[:] = action
+        self.buffers.action[:] = action
         for worker in self.workers:
             worker.command(STEP)
         failures: dict[int, RunBroken] = {}
@@ -80,34 +81,34 @@ class EnvironmentPool:
 
     def ended(self, run: int) -> list[EndedEpisode]:
         """The episodes of a run that ended in the last step."""
-        board, first = self.board, run * self.environments
+        buffers, first = self.buffers, run * self.environments
         return [
-            EndedEpisode(index, float(board.total_reward[place]), int(board.length[place]),
-                         bool(board.terminated[place]))
-            for index, place in enumerate(range(first, first + self.environments)) if board.ended[place]
+            EndedEpisode(index, float(buffers.total_reward[place]), int(buffers.length[place]),
+                         bool(buffers.terminated[place]))
+            for index, place in enumerate(range(first, first + self.environments)) if buffers.ended[place]
         ]  # fmt: skip
 
-    def leave(self, run: int) -> None:
+    def drop(self, run: int) -> None:
         """Step a run no more."""
-        self.board.active[run] = False
-        self.board.ended[self._places(run)] = False
+        self.buffers.active[run] = False
+        self.buffers.ended[self._places(run)] = False
 
     def observation(self, run: int) -> np.ndarray:
         """f32[E, O]."""
-        current: np.ndarray = self.board.observation[self._places(run)].copy()
+        current: np.ndarray = self.buffers.observation[self._places(run)].copy()
         return current
 
-    def work_off(self, jobs: Sequence[Message], asked_to_stop: Callable[[], bool]) -> list[Message]:
+    def work_off(self, jobs: Sequence[Message], should_stop: Callable[[], bool]) -> list[Message]:
         """The workers' replies to these messages, each of which goes to whoever is free.
 
         Raises:
-            Stopped: when `asked_to_stop`; what the jobs have done so far counts for nothing.
+            Stopped: when `should_stop`; what the jobs have done so far counts for nothing.
             EnvironmentWorkerDied: if a process is gone.
         """
         replies: dict[int, Message] = {}
         waiting = list(enumerate(jobs))
         busy: dict[PoolWorker, int] = {}
-        self.board.stop[0] = False
+        self.buffers.stop[0] = False
         with selectors.DefaultSelector() as selector:
             for worker in self.workers:
                 selector.register(worker.answers, selectors.EVENT_READ, worker)
@@ -118,15 +119,15 @@ class EnvironmentPool:
                         worker.send(header, arrays)
                 for key, _ in selector.select(POLL_SECONDS):
                     replies[busy.pop(key.data)] = key.data.receive()
-                if asked_to_stop():
-                    self.board.stop[0] = True
+                if should_stop():
+                    self.buffers.stop[0] = True
                     waiting = []
-        if self.board.stop[0] or any("stopped" in header for header, _ in replies.values()):
+        if self.buffers.stop[0] or any("stopped" in header for header, _ in replies.values()):
             raise Stopped
         return [replies[index] for index in range(len(jobs))]
 
     def capture(self, run: int) -> list[dict[str, Any] | None]:
-        """As `TrainingEnvironments.capture`."""
+        """What `TrainingEnvironments.capture` gives of a run's environments."""
         states: list[dict[str, Any] | None] = []
         for worker in self._owners(run):
             worker.send({"do": "capture", "run": run}, {})
@@ -135,7 +136,11 @@ class EnvironmentPool:
         return states
 
     def restore(self, run: int, states: list[dict[str, Any] | None], new_seeds: list[int]) -> list[int]:
-        """As `TrainingEnvironments.restore`; raises CheckpointError for states that do not fit."""
+        """Continue a run's episodes, as `TrainingEnvironments.restore` does.
+
+        Raises:
+            EnvironmentStateError: for states that do not fit.
+        """
         restarted: list[int] = []
         first = 0
         for worker in self._owners(run):
@@ -144,7 +149,7 @@ class EnvironmentPool:
             worker.send({"do": "restore", "run": run, "rest": rest, "seeds": new_seeds[part]}, arrays)
             reply, _ = worker.receive()
             if "misfit" in reply:
-                raise CheckpointError(reply["misfit"])
+                raise EnvironmentStateError(run, reply["misfit"])
             restarted += [first + index for index in reply["restarted"]]
             first = part.stop
         return restarted
@@ -153,7 +158,7 @@ class EnvironmentPool:
         """End the processes."""
         for worker in self.workers:
             worker.close()
-        self.board.close()
+        self.buffers.close()
 
     def _owners(self, run: int) -> list[PoolWorker]:
         return [worker for worker in self.workers if worker.count(run)]
@@ -168,11 +173,11 @@ class EnvironmentPool:
 class PoolWorker:
     """One of the processes, with the pipes to it."""
 
-    def __init__(self, board: Board, runs: np.ndarray) -> None:
+    def __init__(self, buffers: SharedBuffers, runs: np.ndarray) -> None:
         """Start it.
 
         Args:
-            board: the shared memory.
+            buffers: the shared memory.
             runs: i64[n], ascending: the run of each of its environments.
         """
         self.runs = runs
@@ -183,15 +188,15 @@ class PoolWorker:
             stdout=subprocess.PIPE,
             stderr=self.errors,
             env=os.environ | {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            pass_fds=[board.file_descriptor],
+            pass_fds=[buffers.file_descriptor],
             start_new_session=True,
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.commands, self.answers = self.process.stdin.fileno(), self.process.stdout.fileno()
 
-    def make_environments(self, configs: Sequence[Config], first: int, board: Board) -> None:
-        """Tell it what to make, from place `first` of the board on; its first answer says whether that was possible."""
+    def make_environments(self, configs: Sequence[Config], first: int, buffers: SharedBuffers) -> None:
+        """Tell it what to make, from place `first` of the shared buffers on; its first answer says if it could."""
         environments = configs[0].training.parallel_environments
         shares: list[dict[str, Any]] = []
         for run in dict.fromkeys(self.runs.tolist()):
@@ -200,8 +205,10 @@ class PoolWorker:
             own_seeds = all_seeds[start : start + self.count(run)]
             shares.append({"run": run, "first": run * environments + start, "seeds": own_seeds})
         task = {
-            "sizes": board.sizes._asdict(),
-            "board": board.file_descriptor,
+            "runs": buffers.sizes.runs,
+            "environments": buffers.sizes.environments,
+            "layout": buffers.sizes.layout._asdict(),
+            "buffers": buffers.file_descriptor,
             "configs": {run: config.to_dict() for run, config in enumerate(configs)},
             "shares": shares,
         }
@@ -249,9 +256,9 @@ class PoolWorker:
             self.errors.seek(0)
             last_words = [line for line in self.errors.read().splitlines() if line.strip()][-1:]
             raise EnvironmentWorkerDied(
-                f"the process that steps the environments of runs {sorted(set(self.runs.tolist()))} of the batch ended "
+                f"the process that steps the environments of runs {sorted(set(self.runs.tolist()))} of the group ended "
                 f"with {how}" + "".join(f": {line}" for line in last_words) + ". Nothing that was saved is lost: start "
-                "the same command again to continue the batch from its last checkpoint"
+                "the same command again to continue the group from its last checkpoint"
             ) from error
 
     def close(self) -> None:

@@ -1,10 +1,10 @@
-"""What a batch computes on its devices: S slots side by side, each with a learner and a replay buffer of its own.
+"""What a run group computes on its devices: S slots side by side, each with a learner and a replay buffer of its own.
 
 Two compiled functions. `act` chooses the next actions of all runs; `advance` stores their new transitions, draws the
 minibatches and makes the updates. They are two because what one call gives is ready only when all of it is: the
 actions would otherwise wait for the updates, and the physics for the actions.
 
-Whatever the host knows of a step arrives as one array, and the actions leave as one array. Slots are spread over all
+What the host puts into a step comes as one array, and the actions leave as one array. Slots are spread over all
 devices; as runs have nothing to do with each other, no device ever waits for another.
 """
 
@@ -23,27 +23,27 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import Scalars
 from saclab.algorithm.types import Context, LearnerState, Trained
-from saclab.config import AlgorithmSettings
 from saclab.replay import RowLayout
+from saclab.settings import AlgorithmSettings
 
 RUNS: Any = PartitionSpec("runs")  # type: ignore[no-untyped-call]
 SHARED: Any = PartitionSpec()  # type: ignore[no-untyped-call]
 UNROLLED_UPDATES = 4  # of one call; more are a loop, which compiles sooner
 
 
-class Arrival(NamedTuple):
-    """How what arrives for a step lies in one array i32[S, width]; floating-point numbers are there as their bits."""
+class StepInputs(NamedTuple):
+    """How the inputs of a step lie in one array i32[S, width]; floating-point numbers are there as their bits."""
 
     layout: RowLayout
     environments: int
-    """E, of each run."""
+    """E: environments of each run."""
     updates: int
-    """U, made after this step."""
+    """U: updates made after this step."""
     batch_size: int
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of each part, for one slot."""
+        """The shape of each part, for one slot."""
         return {
             "observation": (self.environments, self.layout.observation_size),
             "noise": (self.environments, self.layout.action_size),
@@ -79,7 +79,7 @@ class Program:
         """For at least `slots` slots: as many as can be spread evenly over the devices.
 
         Args:
-            settings: the structure of the runs' settings.
+            settings: the `structure` of the runs' settings.
             layout: of the transitions.
             environments: of each run.
             slots: how many runs there may be.
@@ -100,8 +100,8 @@ class Program:
         """Host arrays [S, …] on the devices."""
         return jax.device_put(tree, self.sharding)
 
-    def arrival(self, updates: int) -> Arrival:
-        return Arrival(self.layout, self.environments, updates, self.settings.batch_size)
+    def inputs(self, updates: int) -> StepInputs:
+        return StepInputs(self.layout, self.environments, updates, self.settings.batch_size)
 
     def advance(
         self,
@@ -115,7 +115,6 @@ class Program:
         """Store transitions and make `updates` updates: the learners, replay, and metrics f32[S, U, M].
 
         `context` is that of the first update: step i32[], which all share, weights f32[S, T] and scale f32[S].
-
         `replay` f32[S, capacity, width] is used up, and so is the state, but for the actor: it may act for longer.
         """
         if updates not in self._advance:
@@ -137,8 +136,8 @@ class Program:
 
     def _act(self, actor: jax.Array, packed: jax.Array) -> jax.Array:
         """Actions f32[E, A] of one slot."""
-        arrival = self.arrival(0)
-        observation, noise = arrival.unpack(packed, "observation"), arrival.unpack(packed, "noise")
+        inputs = self.inputs(0)
+        observation, noise = inputs.unpack(packed, "observation"), inputs.unpack(packed, "noise")
         action: jax.Array = self.learner.policy.act(actor, observation, noise)
         return action
 
@@ -151,17 +150,17 @@ class Program:
         packed: jax.Array,
         context: Context,
     ) -> tuple[LearnerState, jax.Array, jax.Array]:
-        arrival = self.arrival(updates)
-        positions = (arrival.unpack(packed, "position") + jnp.arange(self.environments)) % len(replay)
-        replay = replay.at[positions].set(arrival.unpack(packed, "rows"))
+        inputs = self.inputs(updates)
+        positions = (inputs.unpack(packed, "position") + jnp.arange(self.environments)) % len(replay)
+        replay = replay.at[positions].set(inputs.unpack(packed, "rows"))
 
-        def update(state: LearnerState, inputs: tuple[jax.Array, jax.Array]) -> tuple[LearnerState, jax.Array]:
-            drawn, step = inputs
+        def update(state: LearnerState, of_update: tuple[jax.Array, jax.Array]) -> tuple[LearnerState, jax.Array]:
+            drawn, step = of_update
             batch = self.layout.unpack(replay[drawn])
             state = self.learner.update(numbers, state, batch, context._replace(step=step))
             return state, state.report
 
-        drawn, steps = arrival.unpack(packed, "drawn"), context.step + jnp.arange(updates, dtype=jnp.int32)
+        drawn, steps = inputs.unpack(packed, "drawn"), context.step + jnp.arange(updates, dtype=jnp.int32)
         unrolled = updates if 0 < updates <= UNROLLED_UPDATES else 1
         state, metrics = jax.lax.scan(update, state, (drawn, steps), unroll=unrolled)
         return state, replay, metrics

@@ -1,4 +1,4 @@
-"""A process that steps some environments of a batch and plays test episodes; it makes no call into JAX.
+"""A process that steps some environments of a run group and plays evaluation episodes; it makes no call into JAX.
 
 It gets its task as a message on standard input, then single bytes (STEP) and messages (MESSAGE before each), and
 answers each on what was its standard output. It ends when its input does.
@@ -13,17 +13,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saclab.algorithm.learner import make_learner
-from saclab.batch.board import Board, Sizes
+from saclab.algorithm.learner import Learner
 from saclab.batch.frames import Arrays, Message, receive, send
+from saclab.batch.shared_buffers import SharedBuffers, Sizes
 from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import NonFiniteError, UserError
 from saclab.replay import RowLayout
-from saclab.training import seeds
 from saclab.training.captured import join_arrays, split_arrays
 from saclab.training.evaluation import Evaluator
-from saclab.training.q_bias import Critics, measure_q_bias
+from saclab.training.learners import learner_of
+from saclab.training.q_bias import critics_of, q_bias_at
 from saclab.training.requests import Stopped
 
 STEP, MESSAGE, DONE = b"s", b"m", b"."
@@ -34,33 +34,35 @@ class Share(NamedTuple):
 
     run: int
     rows: slice
-    """Their places on the board."""
+    """Their places in the shared buffers."""
     environments: TrainingEnvironments
 
 
 class EnvironmentWorker:
     def __init__(self, task: dict[str, Any]) -> None:
         """Make the environments and start their first episodes."""
-        self.board = Board(Sizes(**task["sizes"]), task["board"])
+        self.layout = RowLayout(**task["layout"])
+        self.buffers = SharedBuffers(Sizes(task["runs"], task["environments"], self.layout), task["buffers"])
         self.configs = {int(run): Config.from_dict(config) for run, config in task["configs"].items()}
         self.shares = []
         for share in task["shares"]:
             config = self.configs[share["run"]]
-            environments = TrainingEnvironments(config.environment, config.environment_arguments, share["seeds"])
+            environments = TrainingEnvironments(
+                config.environment, config.environment_arguments, share["seeds"], config.algorithm.reward_terms
+            )
             rows = slice(share["first"], share["first"] + len(share["seeds"]))
             self.shares.append(Share(share["run"], rows, environments))
-            self.board.observation[rows] = environments.observation
+            self.buffers.observation[rows] = environments.observation
         any_config = next(iter(self.configs.values()))
         self.evaluator = Evaluator(any_config.environment, any_config.environment_arguments)
         self.spec = self.evaluator.spec
-        self.layout = RowLayout(self.spec.observation_size, self.spec.action_size)
 
     def step(self) -> Message:
         """Step every active environment once; what went wrong in which run, and the numbers that belong to it."""
         failures: dict[str, Any] = {}
         arrays: Arrays = {}
         for share in self.shares:
-            if not self.board.active[share.run]:
+            if not self.buffers.active[share.run]:
                 continue
             try:
                 self._step(share)
@@ -71,21 +73,21 @@ class EnvironmentWorker:
         return failures, arrays
 
     def _step(self, share: Share) -> None:
-        board, rows = self.board, share.rows
-        transitions, ended = share.environments.step(board.action[rows])
-        board.row[rows] = self.layout.pack(transitions)
-        board.observation[rows] = share.environments.observation
-        board.ended[rows] = False
+        buffers, rows = self.buffers, share.rows
+        transitions, ended = share.environments.step(buffers.action[rows])
+        buffers.row[rows] = self.layout.pack(transitions)
+        buffers.observation[rows] = share.environments.observation
+        buffers.ended[rows] = False
         for episode in ended:
             place = rows.start + episode.environment
-            board.ended[place], board.terminated[place] = True, episode.terminated
-            board.total_reward[place], board.length[place] = episode.total_reward, episode.length
+            buffers.ended[place], buffers.terminated[place] = True, episode.terminated
+            buffers.total_reward[place], buffers.length[place] = episode.total_reward, episode.length
 
     def answer(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """The answer to a message."""
         match header["do"]:
-            case "test":
-                return self.test(header["run"], header["seeds"], arrays["actor"])
+            case "evaluate":
+                return self.evaluate(header["run"], header["seeds"], arrays["actor"])
             case "q_bias":
                 return self.q_bias(header, arrays)
             case "capture":
@@ -95,18 +97,18 @@ class EnvironmentWorker:
                 return self.restore(header, arrays)
         raise ValueError(header["do"])
 
-    def test(self, run: int, test_seeds: list[int], actor: np.ndarray) -> Message:
+    def evaluate(self, run: int, episode_seeds: list[int], actor: np.ndarray) -> Message:
         """One episode of the deterministic policy per seed."""
         policy = self._learner(run).policy
 
         def act(observation: np.ndarray) -> np.ndarray:
-            if self.board.stop[0]:
+            if self.buffers.stop[0]:
                 raise Stopped
             action: np.ndarray = policy.mode(actor, observation)
             return action
 
         try:
-            episodes = self.evaluator.run(act, test_seeds)
+            episodes = self.evaluator.run(act, episode_seeds)
         except Stopped:
             return {"stopped": True}, {}
         except Exception as error:
@@ -114,19 +116,11 @@ class EnvironmentWorker:
         return {}, episodes._asdict()
 
     def q_bias(self, header: dict[str, Any], arrays: Arrays) -> Message:
-        """As `Run.q_bias`."""
-        config, number = self.configs[header["run"]], header["evaluations"]
-        learner = self._learner(header["run"])
-        critics = Critics(
-            learner.policy, arrays["actor"], learner.q_values, arrays["critic"], header["alpha"],
-            config.algorithm.discount,
-        )  # fmt: skip
+        """How far one run's critics are from Monte-Carlo soft returns."""
+        config, learner = self.configs[header["run"]], self._learner(header["run"])
+        critics = critics_of(config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"])
         try:
-            bias = measure_q_bias(
-                critics, self.evaluator.environments[0], self.spec,
-                seeds.integers(config.seed, "q_bias", config.training.q_bias_episodes, number),
-                seeds.generator(config.seed, "q_bias", number),
-            )  # fmt: skip
+            bias = q_bias_at(config, critics, self.evaluator.environments[0], self.spec, header["evaluations"])
         except Exception as error:
             return {"failure": described(error)}, {}
         return {"bias": list(bias)}, {}
@@ -139,18 +133,18 @@ class EnvironmentWorker:
             restarted = share.environments.restore(states, header["seeds"])
         except (KeyError, OverflowError, TypeError, ValueError) as error:
             return {"misfit": str(error)}, {}
-        self.board.observation[share.rows] = share.environments.observation
+        self.buffers.observation[share.rows] = share.environments.observation
         return {"restarted": restarted}, {}
 
     def _share(self, run: int) -> Share:
         return next(share for share in self.shares if share.run == run)
 
-    def _learner(self, run: int) -> Any:
-        return make_learner(self.configs[run].algorithm, self.spec.observation_size, self.spec.action_size)
+    def _learner(self, run: int) -> Learner:
+        return learner_of(self.configs[run].algorithm, self.layout)
 
 
 def described(error: Exception) -> dict[str, str]:
-    """What the batch is told of an error in a run's environment."""
+    """What the engine is told of an error in a run's environment."""
     if isinstance(error, NonFiniteError):
         return {"not_finite": str(error)}
     return {"error": f"{type(error).__name__}: {error}", "traceback": "".join(traceback.format_exception(error))}
@@ -180,4 +174,4 @@ if __name__ == "__main__":
     try:
         main()
     except (EOFError, BrokenPipeError):
-        sys.exit(0)  # the batch is gone
+        sys.exit(0)  # the engine is gone

@@ -14,9 +14,9 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Table
 
 from saclab.api import Comparison
-from saclab.config import TrainingSettings
 from saclab.grid.rate import RateMeter
 from saclab.grid.tasks import RunStatus
+from saclab.settings import TrainingSettings
 from saclab.signals import EXIT_STATUS
 from saclab.training import events
 

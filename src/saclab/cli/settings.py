@@ -12,8 +12,9 @@ from typing import Annotated, Any, TypedDict, get_type_hints
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from saclab.config import AlgorithmSettings, Config, TrainingSettings, field_names
+from saclab.config import Config
 from saclab.protocols import make_config
+from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
 HELP = ("-h", "--help")
 AN_ENVIRONMENT = re.compile(r"-v\d+$")

@@ -10,12 +10,15 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from saclab.config import Config
 from saclab.grid.plan import Cell
 from saclab.grid.tasks import make_statuses, make_tasks
 from saclab.machine import thread_limits
+
+if TYPE_CHECKING:
+    from saclab.training.engine import EngineBuilder
 
 WARM_UPDATES, MEASURED_UPDATES = 5, 40
 
@@ -30,13 +33,13 @@ class Cost(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """What is measured: a run, or several as one batch."""
+    """What is measured: a run alone, or a run group."""
 
     configs: tuple[Config, ...]
     slots: int
-    """Of the batch; 0 for a run alone."""
+    """Room of the group's program; 0 for a run alone."""
     workers: int
-    """Processes that step the environments of a batch."""
+    """Processes that step the environments of a group."""
 
 
 def forecast_hours(cells: Sequence[Cell], workers: int, threads: int, batch: int = 0) -> float:
@@ -68,7 +71,7 @@ def forecast_hours(cells: Sequence[Cell], workers: int, threads: int, batch: int
 
 
 def run_seconds(config: Config, cost: Cost) -> float:
-    """Seconds of a run that goes to its nearest limit of steps or updates, its tests counted in."""
+    """Seconds of a run that goes to its nearest limit of steps or updates, its evaluations counted in."""
     training = config.training
     limits = []
     if training.max_updates is not None:
@@ -80,12 +83,12 @@ def run_seconds(config: Config, cost: Cost) -> float:
     steps = min(limits)
     updates = training.updates_due(int(steps))
     if training.evaluation_interval_episodes is not None:
-        # test episodes are about as long as training episodes, so their number says how many steps they cost
-        tested = steps * training.evaluation_episodes / training.evaluation_interval_episodes
+        # evaluation episodes are about as long as training episodes, so their number says how many steps they cost
+        evaluated = steps * training.evaluation_episodes / training.evaluation_interval_episodes
     else:
         assert training.evaluation_interval_steps is not None
-        tested = steps / training.evaluation_interval_steps * training.evaluation_episodes * 1000
-    return updates * cost.per_update + (training.random_steps + tested) * cost.per_step
+        evaluated = steps / training.evaluation_interval_steps * training.evaluation_episodes * 1000
+    return updates * cost.per_update + (training.random_steps + evaluated) * cost.per_step
 
 
 def measure_in_process(kinds: Sequence[Kind], threads: int) -> list[Cost]:
@@ -102,37 +105,35 @@ def measure_in_process(kinds: Sequence[Kind], threads: int) -> list[Cost]:
 
 
 def measure(kind: Kind) -> Cost:
-    """Train for a moment: nothing is written. Of a batch, an update is one of all its runs."""
-    import numpy as np
-
-    from saclab.batch.batch import Batch
-    from saclab.training.course import Course
+    """Train for a moment: nothing is written. In a group, an update is one of all its runs."""
+    from saclab.training.engine import build_new
     from saclab.training.process import prepare_process
-    from saclab.training.run import Run
 
     prepare_process()
-    configs = [endless(config) for config in kind.configs]
-    trained: Run | Batch
-    if kind.slots:
-        trained = Batch(configs, kind.slots, kind.workers)
-        trained.begin()
-        run: Course = trained.members[0]
-    else:
-        trained = run = Run(configs[0])
-    counters, random_steps = run.counters, run.config.training.random_steps
-    with closing(trained):
+    with closing(build_new(builder_of(kind))) as engine:
+        run = engine.runs[0]
+        counters, random_steps = run.counters, run.config.training.random_steps
         began = time.perf_counter()
         while counters.steps < random_steps:
-            trained.step()
+            engine.step()
         per_step = (time.perf_counter() - began) / counters.steps
         while counters.updates < WARM_UPDATES:
-            trained.step()
-        np.array(run.actor)  # waits for the updates
+            engine.step()
+        engine.actor(0)  # waits for the updates
         began, first = time.perf_counter(), counters.updates
         while counters.updates < first + MEASURED_UPDATES:
-            trained.step()
-        np.array(run.actor)
+            engine.step()
+        engine.actor(0)
         return Cost((time.perf_counter() - began) / (counters.updates - first), per_step)
+
+
+def builder_of(kind: Kind) -> EngineBuilder:
+    """The builder of the engine that would train these runs."""
+    from saclab.batch.builder import DeviceBuilder
+    from saclab.training.local_engine import LocalBuilder
+
+    configs = [endless(config) for config in kind.configs]
+    return DeviceBuilder(configs, kind.slots, kind.workers) if kind.slots else LocalBuilder(configs[0])
 
 
 def endless(config: Config) -> Config:

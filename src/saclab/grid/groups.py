@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from saclab.config import Config
-from saclab.config import structure as algorithm_structure
+from saclab.config import group_key
 from saclab.grid.plan import Cell
 from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
 from saclab.training.run_folder import FAILURE
 
-FREE = (
-    "max_steps", "max_episodes", "patience_episodes", "evaluation_interval_episodes",
-    "evaluation_interval_steps", "evaluation_episodes", "q_bias_episodes", "log_interval",
-)  # fmt: skip
-"""Settings of training in which the runs of a batch may differ: they decide nothing of a step."""
 NO_CHECKPOINT = -1  # in place of a step: one of step 0 is something else
 
 
@@ -30,18 +22,11 @@ class RunGroup(NamedTuple):
     """As many as runs, or as the run group had from which they are continued."""
 
 
-def structure(config: Config) -> str:
-    """What the runs of a batch have in common: everything but the seed, plain numbers and when a run is tested."""
-    algorithm = dataclasses.asdict(algorithm_structure(config.algorithm))
-    training = {name: value for name, value in dataclasses.asdict(config.training).items() if name not in FREE}
-    return json.dumps([config.environment, config.environment_arguments, algorithm, training], sort_keys=True)
-
-
 def run_groups(cells: Sequence[Cell], size: int) -> list[RunGroup]:
     """Groups of at most `size` unfinished cells of the same structure that have come equally far, in their order."""
     kinds: dict[str, list[int]] = {}
     for index, cell in enumerate(cells):
-        kinds.setdefault(structure(cell.config), []).append(index)
+        kinds.setdefault(group_key(cell.config), []).append(index)
     groups = []
     for members in kinds.values():
         for equally_far in by_progress(cells, members):

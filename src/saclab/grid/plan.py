@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from saclab.config import Config, require
+from saclab.config import Config
 from saclab.protocols import make_config, protocol_row
+from saclab.settings import require
 from saclab.training.run_folder import is_finished, run_path
 
 
@@ -90,8 +91,8 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
         fewer: the option that would lower their number.
     """
     from saclab.environments.make import environment_spec, make_environment
-    from saclab.replay import RowLayout, require_memory
-    from saclab.training.journal import require_same_config
+    from saclab.replay import layout_of, require_memory
+    from saclab.training.starts import require_same_config
 
     checked = set()
     for cell in cells:
@@ -104,5 +105,5 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
         spec = environment_spec(cell.config.environment, environment)
         environment.close()
         if at_once:
-            layout = RowLayout(spec.observation_size, spec.action_size)
+            layout = layout_of(spec, cell.config.algorithm)
             require_memory(cell.config.training.replay_capacity, layout, at_once, fewer)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
-from saclab.config import require
 from saclab.grid.cluster import Cluster, chosen_cluster
 from saclab.grid.groups import run_groups
 from saclab.grid.local import local_pool
@@ -14,6 +13,7 @@ from saclab.grid.plan import Cell, require_startable
 from saclab.grid.pool import WorkerPool
 from saclab.grid.ray import ray_pool
 from saclab.machine import accelerator, usable_cores
+from saclab.settings import require
 
 BATCH_ON_ACCELERATOR = 16
 """Runs that are trained together, unless another number is asked for."""
@@ -91,7 +91,7 @@ def chosen_batch(batch: int | None, launcher: str = "local", ray_gpus: float = 0
 
 def batch_note(cells: Sequence[Cell], batch: int) -> str:
     """What a user should know of a grid that is trained in run groups of at most `batch`."""
-    from saclab.training.journal import ratio_note
+    from saclab.training.starts import ratio_note
 
     groups = run_groups([cell for cell in cells if not cell.finished], batch)
     sizes = ", ".join(str(len(group.members)) for group in groups) or "none to do"

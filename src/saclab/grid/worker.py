@@ -1,4 +1,4 @@
-"""The runs of one task in a process of their own: a run alone, or several as one batch.
+"""The runs of one task in a process of their own: a run alone, or a run group.
 
 The task comes as JSON on standard input; each event goes out as a line of JSON that names the run by its place.
 """

@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-from saclab.config import Config, TrainingSettings
+from saclab.config import Config
 from saclab.errors import UserError
 from saclab.protocols import PROTOCOLS, make_config, training_settings
 from saclab.report.text import shown
+from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord, safe_name
 from saclab.variants import VARIANTS
 

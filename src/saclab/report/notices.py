@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from saclab.config import TrainingSettings
 from saclab.errors import UserError
 from saclab.protocols import training_settings
 from saclab.report.runs import Comparison
 from saclab.report.text import shown
+from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord
 
 

@@ -14,10 +14,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from saclab.config import AlgorithmSettings, field_names
 from saclab.errors import UserError
 from saclab.report.arms import Arm, arm_of, beside_variant, conditions, is_known, own_name, unlike, unlike_in_arm
 from saclab.report.text import shown
+from saclab.settings import AlgorithmSettings, field_names
 from saclab.training.run_folder import RunRecord, read_run
 
 

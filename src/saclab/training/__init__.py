@@ -1,1 +1,1 @@
-"""A run: the loop, its tests of the policy, and what it leaves on disk."""
+"""A run: its state, the engine that steps it, the loop, its evaluations, and what it leaves on disk."""

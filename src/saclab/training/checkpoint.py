@@ -1,6 +1,6 @@
 """Checkpoints: written whole or not at all, checksummed, never unpickled, and cheap to take often.
 
-    checkpoints/step-000000012000/                       or step-…-untested, if a test of the policy comes first
+    checkpoints/step-000000012000/                       or step-…-untested, if an evaluation comes first
       learner.safetensors, environments.safetensors, …   one file per group of arrays
       replay-0000.safetensors, …                         the replay buffer, SEGMENT_ROWS rows each
       manifest.json                                      every file's SHA-256 and size, and the plain state
@@ -20,9 +20,9 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import safetensors.numpy
@@ -30,7 +30,7 @@ import safetensors.numpy
 from saclab.errors import TrainingFailed
 from saclab.files import sync, write_bytes
 from saclab.machine import available_memory
-from saclab.replay import ReplayBuffer
+from saclab.replay import ReplayBuffer, RowLayout
 from saclab.training import format_1
 
 FORMAT, OLDEST_FORMAT = 2, 1
@@ -54,22 +54,44 @@ class Checkpoint(NamedTuple):
     """Group -> name -> array."""
     state: dict[str, Any]
     """JSON-able."""
+    transitions: int = 0
+    """Transitions added to the replay buffer since the start of the run."""
     format: int = FORMAT
     """As it was written; the groups are as of today."""
 
 
+class Replay(Protocol):
+    """A replay buffer as far as it has to be read: that of the host, or one that lies on a device."""
+
+    @property
+    def capacity(self) -> int: ...
+
+    @property
+    def added(self) -> int: ...
+
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def rows(self) -> Any:
+        """f32[capacity, width], which can be indexed."""
+
+    @property
+    def layout(self) -> RowLayout: ...
+
+
 def save_checkpoint(
-    folder: Path, step: int, checkpoint: Checkpoint, replay: ReplayBuffer, untested: bool = False
+    folder: Path, step: int, checkpoint: Checkpoint, replay: Replay, evaluate_first: bool = False
 ) -> Path:
     """Write `folder`/step-… and remove all but the newest two; an existing one of the same name stays.
 
-    An `untested` one is of the moment before the test of the policy that falls into this step, and older than one
-    of the moment after it.
+    With `evaluate_first` it is of the moment before the evaluation that falls into this step, and older than one of
+    the moment after it.
 
     Raises:
         CheckpointError: if it cannot be written; what was there before is whole.
     """
-    final = folder / f"step-{step:012d}{'-untested' if untested else ''}"
+    final = folder / f"step-{step:012d}{'-untested' if evaluate_first else ''}"
     if final.exists():
         return final
     partial = final.with_suffix(".partial")
@@ -104,31 +126,6 @@ def cannot_save(final: Path, error: OSError) -> str:
     )
 
 
-def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[str], None]) -> Checkpoint | None:
-    """The newest checkpoint that is whole, its transitions put into `replay`; None if there is none at all.
-
-    Newer ones that are not whole are set aside.
-
-    Raises:
-        CheckpointError: if there are checkpoints and every one is damaged; they stay as they are.
-    """
-    damaged, problems = [], []
-    for path in newest_first(folder):
-        try:
-            checkpoint = read_checkpoint(path, replay)
-        except (CheckpointError, OSError) as error:
-            damaged.append(path)
-            problems.append(f"{path} is damaged: {error}")
-            continue
-        for bad, problem in zip(damaged, problems, strict=True):
-            set_aside(bad, ".damaged")
-            warn(f"{problem}; it is set aside, and {path.name} before it is used")
-        return checkpoint
-    if problems:
-        raise CheckpointError("no checkpoint can be used. " + "; ".join(problems))
-    return None
-
-
 def set_aside(checkpoint: Path, suffix: str) -> None:
     """From now on it is none."""
     shutil.rmtree(checkpoint.with_suffix(suffix), ignore_errors=True)
@@ -160,7 +157,7 @@ def remove_all(paths: Iterable[Path]) -> None:
 # --- writing
 
 
-def write_files(folder: Path, checkpoint: Checkpoint, replay: ReplayBuffer, link_from: Path | None) -> None:
+def write_files(folder: Path, checkpoint: Checkpoint, replay: Replay, link_from: Path | None) -> None:
     files = {
         f"{group}.safetensors": write_arrays(folder / f"{group}.safetensors", arrays)
         for group, arrays in checkpoint.groups.items()
@@ -182,7 +179,7 @@ def write_files(folder: Path, checkpoint: Checkpoint, replay: ReplayBuffer, link
     write_bytes(folder / MANIFEST_CHECKSUM, (hashlib.sha256(content).hexdigest() + "\n").encode())
 
 
-def write_replay(folder: Path, replay: ReplayBuffer, link_from: Path | None) -> dict[str, dict[str, Any]]:
+def write_replay(folder: Path, replay: Replay, link_from: Path | None) -> dict[str, dict[str, Any]]:
     """Link the segments that `link_from` has already and write the others; `version` tells what a segment holds."""
     old_files = linkable_files(link_from)
     files = {}
@@ -216,13 +213,13 @@ def linked(source: Path, destination: Path, size: int) -> bool:
     return True
 
 
-def segments(replay: ReplayBuffer) -> Iterator[slice]:
+def segments(replay: Replay) -> Iterator[slice]:
     """The rows of each segment; to look at them may mean to fetch them from a device."""
     for start in range(0, replay.size, SEGMENT_ROWS):
         yield slice(start, min(start + SEGMENT_ROWS, replay.size))
 
 
-def segment_version(index: int, replay: ReplayBuffer) -> int:
+def segment_version(index: int, replay: Replay) -> int:
     """The number of the newest transition in a segment: it changes whenever the segment does."""
     start = index * SEGMENT_ROWS
     length = min(SEGMENT_ROWS, replay.size - start)
@@ -311,7 +308,7 @@ def read_checkpoint(folder: Path, replay: ReplayBuffer) -> Checkpoint:
     replay.added = buffer["added"]
     if manifest["format"] == 1:
         groups["learner"] = format_1.today(groups.get("learner", {}))
-    return Checkpoint(groups, manifest["state"], manifest["format"])
+    return Checkpoint(groups, manifest["state"], replay.added, manifest["format"])
 
 
 def read_arrays(folder: Path, name: str, entry: dict[str, Any]) -> Arrays:

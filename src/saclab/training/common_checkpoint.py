@@ -1,14 +1,15 @@
-"""What the checkpoints of several runs have in common, so that they can be continued as one batch."""
+"""Which checkpoints runs can be continued from together: the newest whole ones of the same step. One run is a case."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from saclab.replay import ReplayBuffer
 from saclab.training.checkpoint import (
+    Checkpoint,
     CheckpointError,
     newest_first,
     read_checkpoint,
@@ -17,7 +18,7 @@ from saclab.training.checkpoint import (
     step_of,
 )
 
-LARGEST_BATCH = 4096
+LARGEST_GROUP = 4096
 
 
 def checkpoint_steps(run: Path) -> list[int]:
@@ -26,7 +27,7 @@ def checkpoint_steps(run: Path) -> list[int]:
 
 
 def batch_slots(run: Path) -> int:
-    """Slots of the batch in which a run was saved last, or begun; 0 if it was not begun, or is alone."""
+    """Slots of the group in which a run was saved last, or begun; 0 if it was not begun, or is alone."""
     for path in newest_first(run / "checkpoints"):
         with suppress(CheckpointError, OSError):
             return slots_among(read_manifest(path)["state"].get("facts"))
@@ -39,45 +40,86 @@ def slots_among(facts: object) -> int:
     """The slots in what `machine_facts` gave, if that is what it is."""
     machine = facts.get("machine") if isinstance(facts, dict) else None
     slots = machine.get("batch") if isinstance(machine, dict) else None
-    return slots if type(slots) is int and 0 <= slots <= LARGEST_BATCH else 0
+    return slots if type(slots) is int and 0 <= slots <= LARGEST_GROUP else 0
 
 
-def common_checkpoints(
-    runs: Sequence[Path], replay: ReplayBuffer, warns: Sequence[Callable[[str], None]]
-) -> list[Path]:
-    """The checkpoints of the newest step of which every run folder has a whole one; an empty list if none has any.
+def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[str], None]) -> Checkpoint | None:
+    """The newest checkpoint in `folder` that is whole, its transitions put into `replay`; None if there is none."""
+    found = read_common([folder], lambda run, path: read_checkpoint(path, replay), [warn])
+    return found[0] if found else None
 
-    Each is read once to see that it is whole, its transitions into `replay`.
 
-    Newer ones are taken away: they are damaged, or the others were not saved before the process was killed.
+def read_common(
+    folders: Sequence[Path], read: Callable[[int, Path], Checkpoint], warns: Sequence[Callable[[str], None]]
+) -> list[Checkpoint]:
+    """Each run's checkpoint of the newest step of which all have a whole one; an empty list if there is none at all.
+
+    Newer ones are set aside: they are damaged, or the others were not saved before the process was killed.
+
+    Args:
+        folders: of the checkpoints, one for each run.
+        read: reads a run's checkpoint, its transitions to where they belong; each file is read once unless
+            one is damaged.
+        warns: told for each run what is damaged.
 
     Raises:
-        CheckpointError: if there is no such step; the checkpoints stay as they are then.
+        CheckpointError: if there are checkpoints and no such step; they stay as they are.
     """
-    found = [{step_of(path): path for path in reversed(newest_first(run / "checkpoints"))} for run in runs]
-    if not any(found):
+    by_step = [checkpoints_by_step(folder) for folder in folders]
+    if not any(by_step):
         return []
     damaged: dict[Path, str] = {}
-    for step in sorted(set.intersection(*(set(paths) for paths in found)), reverse=True):
-        checkpoints = [paths[step] for paths in found]
-        for path in checkpoints:
-            try:
-                read_checkpoint(path, replay)
-            except (CheckpointError, OSError) as error:
-                damaged[path] = f"{path} is damaged: {error}"
-        if damaged.keys() & set(checkpoints):
+    for step in sorted(set.intersection(*(set(paths) for paths in by_step)), reverse=True):
+        found = [first_whole(run, paths[step], read, damaged) for run, paths in enumerate(by_step)]
+        whole = [each for each in found if each is not None]
+        if len(whole) < len(folders):
             continue
-        for paths, warn in zip(found, warns, strict=True):
-            for newer in (paths[other] for other in paths if other > step):
-                set_aside(newer, ".damaged" if newer in damaged else ".partial")
-                if newer in damaged:
-                    warn(f"{damaged[newer]}; it is set aside, and {paths[step].name} before it is used")
-        return checkpoints
-    problems = list(damaged.values()) + [
-        f"{run} has {', '.join(path.name for path in paths.values()) or 'none'}"
-        for run, paths in zip(runs, found, strict=True)
+        for folder, (path, _), warn in zip(folders, whole, warns, strict=True):
+            set_aside_newer(folder, path, damaged, warn)
+        return [checkpoint for _, checkpoint in whole]
+    raise CheckpointError(nothing_in_common(folders, by_step, list(damaged.values())))
+
+
+def checkpoints_by_step(folder: Path) -> dict[int, list[Path]]:
+    """Step -> its checkpoints, newest first: there are two where one was taken before an evaluation of this step."""
+    found: dict[int, list[Path]] = {}
+    for path in newest_first(folder):
+        found.setdefault(step_of(path), []).append(path)
+    return found
+
+
+def first_whole(
+    run: int, paths: Sequence[Path], read: Callable[[int, Path], Checkpoint], damaged: dict[Path, str]
+) -> tuple[Path, Checkpoint] | None:
+    """The first that can be read; those before it are entered as damaged."""
+    for path in paths:
+        try:
+            return path, read(run, path)
+        except (CheckpointError, OSError) as error:
+            damaged[path] = f"{path} is damaged: {error}"
+    return None
+
+
+def set_aside_newer(folder: Path, used: Path, damaged: Mapping[Path, str], warn: Callable[[str], None]) -> None:
+    """Take away the checkpoints that are newer than the one that is used."""
+    checkpoints = newest_first(folder)
+    for newer in checkpoints[: checkpoints.index(used)]:
+        set_aside(newer, ".damaged" if newer in damaged else ".partial")
+        if newer in damaged:
+            warn(f"{damaged[newer]}; it is set aside, and {used.name} before it is used")
+
+
+def nothing_in_common(
+    folders: Sequence[Path], by_step: Sequence[Mapping[int, Sequence[Path]]], problems: list[str]
+) -> str:
+    """Why the runs cannot be continued, and the way out."""
+    if len(folders) == 1:
+        return "no checkpoint can be used. " + "; ".join(problems)
+    problems += [
+        f"{folder.parent} has {', '.join(path.name for paths in steps.values() for path in paths) or 'none'}"
+        for folder, steps in zip(folders, by_step, strict=True)
     ]
-    raise CheckpointError(
-        f"the runs of the batch have no whole checkpoint of the same step: {'; '.join(problems)}. Continue them each "
-        "alone (--batch 0), or in batches of those that are equally far"
+    return (
+        f"the runs of the group have no whole checkpoint of the same step: {'; '.join(problems)}. Continue them each "
+        "alone (--batch 0), or in groups of those that are equally far"
     )

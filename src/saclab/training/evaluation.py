@@ -1,4 +1,4 @@
-"""Test episodes with the deterministic policy, stepped side by side with one policy call per step."""
+"""Evaluation episodes of the deterministic policy, stepped side by side with one policy call per step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class EvaluationEpisodes(NamedTuple):
 
 
 class Evaluator:
-    """Test environments of their own: an evaluation leaves training as it was."""
+    """Environments of its own: an evaluation leaves training as it was."""
 
     def __init__(self, environment: str, arguments: Mapping[str, Any]) -> None:
         self.name, self.arguments = environment, arguments
@@ -57,8 +57,8 @@ class Evaluator:
         if not finite.all():
             episodes = np.flatnonzero(~finite).tolist()
             raise NonFiniteError(
-                f"test episodes {episodes} of {self.name} gave an observation or a reward that is not finite: check "
-                "the environment, or wrap it so that it ends the episode before it diverges"
+                f"evaluation episodes {episodes} of {self.name} gave an observation or a reward that is not finite: "
+                "check the environment, or wrap it so that it ends the episode before it diverges"
             )
 
     def close(self) -> None:

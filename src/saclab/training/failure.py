@@ -10,13 +10,15 @@ import safetensors.numpy
 
 from saclab.errors import RunBroken
 from saclab.files import replace_file, write_json
-from saclab.training.course import Course, named_leaves
+from saclab.training.checkpoint import newest_first
+from saclab.training.learners import named_leaves
 from saclab.training.run_folder import FAILURE
+from saclab.training.snapshot import Snapshot
 
 RECENT_ROWS = 1000
 
 
-def write_failure(folder: Path, run: Course, error: RunBroken) -> Path:
+def write_failure_report(folder: Path, snapshot: Snapshot, error: RunBroken) -> str:
     """Write `folder`/failure: the offending step, the counters, the learner and the last transitions; no checkpoint.
 
     Files:
@@ -25,16 +27,30 @@ def write_failure(folder: Path, run: Course, error: RunBroken) -> Path:
             the replay buffer; observation f32[N, O] before the step; metrics f32[updates, M] since the last line of
             metrics.jsonl; and what the error brought: action f32[A], next_observation f32[O] and reward f64[] of the
             environment's step.
+
+    Returns:
+        A sentence that says where to look.
     """
     failure = folder / FAILURE
-    failure.mkdir(exist_ok=True)
-    story = {"message": str(error), "counters": dataclasses.asdict(run.counters), "traceback": error.traceback}
-    write_json(failure / "failure.json", story)
-    recent = np.arange(run.replay.added - min(RECENT_ROWS, run.replay.size), run.replay.added) % run.replay.capacity
-    arrays = {name: np.array(leaf) for name, leaf in named_leaves(run.learner()).items()}
-    arrays |= {"recent_transitions": run.replay.rows[recent], "observation": run.observation}
-    if run.window:
-        arrays["metrics"] = np.stack([np.asarray(values) for values in run.window])
-    arrays |= error.arrays
-    replace_file(failure / "state.safetensors", safetensors.numpy.save(arrays))
-    return failure
+    try:
+        failure.mkdir(exist_ok=True)
+        counters = dataclasses.asdict(snapshot.run.counters)
+        story = {"message": str(error), "counters": counters, "traceback": error.traceback}
+        write_json(failure / "failure.json", story)
+        replace_file(failure / "state.safetensors", safetensors.numpy.save(report_arrays(snapshot, error)))
+        left = f"What led to it lies in {failure}"
+    except OSError as problem:
+        left = f"What led to it could not be written to {folder} ({problem.strerror})"
+    kept = newest_first(folder / "checkpoints")
+    return left + (f"; the last checkpoint, {kept[0].name}, is kept" if kept else "")
+
+
+def report_arrays(snapshot: Snapshot, error: RunBroken) -> dict[str, np.ndarray]:
+    """The arrays of state.safetensors."""
+    replay, window = snapshot.replay, snapshot.run.window
+    recent = np.arange(replay.added - min(RECENT_ROWS, replay.size), replay.added) % replay.capacity
+    arrays = {name: np.array(leaf) for name, leaf in named_leaves(snapshot.learner).items()}
+    arrays |= {"recent_transitions": replay.rows[recent], "observation": snapshot.observation}
+    if window:
+        arrays["metrics"] = np.stack([np.asarray(values) for values in window])
+    return arrays | error.arrays

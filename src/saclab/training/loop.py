@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from saclab.config import Config
-from saclab.errors import NonFiniteError, TrainingFailed
+from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
 from saclab.machine import machine_facts
-from saclab.training.checkpoint import load_newest_checkpoint
-from saclab.training.events import Evaluated, Event, Interrupted, Saved, Started
-from saclab.training.journal import Journal, require_same_config, what_is_left
+from saclab.training.engine import Engine, EngineBuilder
+from saclab.training.events import Event, Failed, Interrupted, Started
+from saclab.training.failure import write_failure_report
+from saclab.training.local_engine import LocalBuilder
 from saclab.training.lock import locked
 from saclab.training.process import device_name, prepare_process
 from saclab.training.requests import Requests, Stopped
-from saclab.training.run import Run
 from saclab.training.run_folder import is_finished
+from saclab.training.run_writer import RunWriter
+from saclab.training.snapshot import Snapshot
+from saclab.training.starts import build, find_beginnings, require_same_config
 
 PROGRESS_SECONDS = 0.25
-EVALUATE_FIRST = -1  # for `evaluation_slots`: a test is due before the next step
+Told = Iterator[tuple[int, Event]]
+"""The place of a run, and what it tells."""
 
 
 def train(
@@ -38,86 +42,206 @@ def train(
         UserError: if the folder holds another configuration, or is in use by another process.
         TrainingFailed: if a number is not finite or no checkpoint can be written or read; what was saved is kept.
     """
-    if is_finished(folder):
-        require_same_config(folder, config)
+    if not unfinished([config], [folder]):
         return
     prepare_process()
-    with closing(Run(config)) as run:  # before the folder is touched: bad input leaves nothing behind
-        try:
-            with locked(folder), closing(Session(run, folder, requests or Requests(), checkpoint_minutes)) as session:
-                yield from session.events()
-        except NonFiniteError as error:
-            raise NonFiniteError(f"{error}. {what_is_left(folder, run, error)}") from error
-        except OSError as error:
-            raise TrainingFailed(
-                f"cannot write to {folder}: {error.strerror or error}; what was saved is kept: make room, or give this "
-                f"process leave to write there, then start the same command again or: saclab resume {folder}"
-            ) from error
+    with closing(train_runs(LocalBuilder(config), [folder], requests, checkpoint_minutes)) as told:
+        for _, event in told:
+            if isinstance(event, Failed):
+                raise NonFiniteError(event.message)
+            yield event
+
+
+def unfinished(configs: Sequence[Config], folders: Sequence[Path]) -> list[int]:
+    """The places of the runs that are not at their end; raises UserError if one that is has other settings."""
+    places = []
+    for place, (config, folder) in enumerate(zip(configs, folders, strict=True)):
+        if is_finished(folder):
+            require_same_config(folder, config)
+        else:
+            places.append(place)
+    return places
+
+
+def train_runs(
+    builder: EngineBuilder, folders: Sequence[Path], requests: Requests | None, checkpoint_minutes: float
+) -> Generator[tuple[int, Event]]:
+    """Train the runs of an engine, from the start or from their newest common checkpoint.
+
+    Args:
+        builder: of the engine.
+        folders: the run folders; made if they do not exist.
+        requests: asks all runs to stop or save.
+        checkpoint_minutes: wall-clock time between checkpoints.
+
+    Yields:
+        The place of a run, and what it tells.
+    """
+    with writing_to(folders), ExitStack() as stack:
+        for folder in folders:
+            stack.enter_context(locked(folder))
+        facts = machine_facts(device_name(), builder.slots)
+        beginnings = find_beginnings(builder, folders, facts)
+        engine = stack.enter_context(closing(build(builder, beginnings, folders)))
+        writers = [
+            stack.enter_context(closing(RunWriter(beginning, builder.spec, folder, facts)))
+            for beginning, folder in zip(beginnings, folders, strict=True)
+        ]
+        del beginnings  # the engine has taken what is large in them
+        yield from Session(engine, writers, requests or Requests(), checkpoint_minutes).events()
+
+
+@contextmanager
+def writing_to(folders: Sequence[Path]) -> Iterator[None]:
+    """Turn what goes wrong with the run folders into a TrainingFailed that says the way on."""
+    try:
+        yield
+    except OSError as error:
+        alone = len(folders) == 1
+        raise TrainingFailed(
+            f"cannot write to {folders[0] if alone else error.filename or f'{folders[0]}, …'}: "
+            f"{error.strerror or error}; what was saved is kept: make room, or give this "
+            "process leave to write there, then start the same command again"
+            + (f" or: saclab resume {folders[0]}" if alone else "")
+        ) from error
 
 
 class Session:
-    """One process's work on a run that is alone: the run, its journal and its clocks."""
+    """One process's work on the runs of an engine: their writers and its clocks."""
 
-    def __init__(self, run: Run, folder: Path, requests: Requests, checkpoint_minutes: float) -> None:
-        self.run, self.requests = run, requests
+    def __init__(
+        self, engine: Engine, writers: Sequence[RunWriter], requests: Requests, checkpoint_minutes: float
+    ) -> None:
+        self.engine, self.writers, self.requests = engine, writers, requests
         self.checkpoint_seconds = 60 * checkpoint_minutes
-        self.journal = Journal(run, folder, machine_facts(device=device_name()))
-        if self.journal.begun_before:
-            checkpoint = load_newest_checkpoint(folder / "checkpoints", run.replay, self.journal.notes.append)
-            if checkpoint is not None:
-                self.journal.restore(checkpoint)
-        self.journal.open()
-        self.last_progress = time.monotonic()
+        self.active = list(range(len(engine.runs)))
+        """The runs that go on."""
+        self.last_save = self.last_progress = time.monotonic()
 
-    def events(self) -> Iterator[Event]:
-        run, journal = self.run, self.journal
-        yield Started(journal.folder, journal.resumed_at_step, tuple(journal.notes))
+    def events(self) -> Told:
+        """Until every run has finished or failed, or a request to stop."""
+        for run in self.active:
+            writer = self.writers[run]
+            yield run, Started(writer.folder, writer.resumed_at_step, tuple(writer.notes))
+        runs = self.engine.runs
         while True:
-            if run.evaluation_due():
-                try:
-                    yield self._test()
-                except Stopped:
-                    run.counters.evaluation_slots = EVALUATE_FIRST
-                    yield from self._stop(untested=True)
+            try:
+                if due := [run for run in self.active if runs[run].evaluation_due()]:
+                    yield from self._evaluate(due)
+                if self.requests.stop:
+                    yield from self._stop()
                     return
-            if self.requests.stop:
+                # before a save that comes by the clock: the last checkpoint is the one after the last evaluation
+                if ending := {run: reason for run in self.active if (reason := runs[run].finish_reason())}:
+                    yield from self._finish(ending)
+            except Stopped:
                 yield from self._stop()
                 return
-            if (reason := run.finish_reason()) is not None:
-                break  # before a save that comes by the clock: the last checkpoint is the one after the last test
+            if not self.active:
+                return
             now = time.monotonic()
-            if self.requests.save or now - journal.last_save > self.checkpoint_seconds:
-                yield self._save()
+            if self.requests.save or now - self.last_save > self.checkpoint_seconds:
+                yield from self._save()
             if now - self.last_progress > PROGRESS_SECONDS:
                 self.last_progress = now
-                yield journal.progress()
-            for episode in run.step():
-                yield from journal.log_episode(episode)
-            yield from journal.log_updates()
-        yield from self._finish(reason)
+                for run in self.active:
+                    yield run, self.writers[run].progress()
+            yield from self._step()
 
-    def close(self) -> None:
-        self.journal.close()
+    def _step(self) -> Told:
+        result = self.engine.step()
+        for run, (error, snapshot) in result.broken.items():
+            yield self._fail(run, error, snapshot)
+        for run, episodes in result.ended.items():
+            for episode in episodes:
+                for event in self.writers[run].log_episode(episode):
+                    yield run, event
+        for run in tuple(self.active):
+            state = self.engine.runs[run]
+            if state.window_size >= state.config.training.log_interval:
+                yield from self._log_updates(run)
 
-    def _test(self) -> Evaluated:
-        episodes, best = self.run.evaluate(lambda: self.requests.stop != 0)
-        return self.journal.log_test(episodes, best, self.run.q_bias())
+    def _log_updates(self, run: int) -> Told:
+        self.engine.deliver_metrics()
+        try:
+            for event in self.writers[run].log_updates():
+                yield run, event
+        except NonFiniteError as error:
+            yield self._fail(run, error, self.engine.snapshot(run))
 
-    def _save(self, untested: bool = False) -> Saved:
+    def _fail(self, run: int, error: RunBroken, snapshot: Snapshot) -> tuple[int, Event]:
+        """Leave a run behind, with what is known of its end in its folder."""
+        try:
+            snapshot.run.window_array()  # an update may have broken first, and the environment only met what came of it
+        except NonFiniteError as first:
+            error = first
+        message = f"{error}. {write_failure_report(self.writers[run].folder, snapshot, error)}"
+        self._drop(run)
+        return run, Failed(message)
+
+    def _drop(self, run: int) -> None:
+        self.active.remove(run)
+        self.engine.drop(run)
+
+    def _evaluate(self, runs: Sequence[int]) -> Told:
+        """Evaluate these runs' policies.
+
+        Raises:
+            Stopped: on a request to stop; each of them is as before then, and will be evaluated first.
+        """
+        engine, evaluated = self.engine, {}
+        try:
+            found = engine.evaluate(runs, lambda: self.requests.stop != 0)
+        except Stopped:
+            for run in runs:
+                engine.runs[run].postpone_evaluation()
+            raise
+        for run in runs:
+            match found[run]:
+                case RunBroken() as error:
+                    yield self._fail(run, error, engine.snapshot(run))
+                case episodes:
+                    evaluated[run] = episodes, engine.runs[run].enter_evaluation(episodes, engine.actor(run))
+        biases = engine.measure_q_bias(list(evaluated))
+        for run, (episodes, best) in evaluated.items():
+            match biases.get(run):
+                case RunBroken() as error:
+                    yield self._fail(run, error, engine.snapshot(run))
+                case bias:
+                    yield run, self.writers[run].log_evaluation(episodes, best, bias)
+
+    def _finish(self, reasons: dict[int, str]) -> Told:
+        """Log, evaluate and save these runs for the last time; raises Stopped as `_evaluate` does."""
+        states = self.engine.runs
+        for run in reasons:
+            if states[run].window_size:
+                yield from self._log_updates(run)
+        counters = {run: states[run].counters for run in reasons if run in self.active}
+        if changed := [run for run, own in counters.items() if own.evaluated_at_update != own.updates]:
+            yield from self._evaluate(changed)
+        for run in counters:
+            if run in self.active:
+                yield from self._save_run(run)
+            if run in self.active:
+                for event in self.writers[run].finish(reasons[run]):
+                    yield run, event
+                self._drop(run)
+
+    def _save(self) -> Told:
+        """A checkpoint of every run, all of the same step."""
         self.requests.save = False
-        return self.journal.save(untested)
+        for run in tuple(self.active):
+            yield from self._save_run(run)
+        self.last_save = time.monotonic()
 
-    def _stop(self, untested: bool = False) -> Iterator[Event]:
-        yield self._save(untested)
-        yield Interrupted(self.run.counters.steps)
+    def _save_run(self, run: int) -> Told:
+        snapshot = self.engine.snapshot(run)
+        try:
+            yield run, self.writers[run].save(snapshot, self.engine.capture_environments(run))
+        except NonFiniteError as error:
+            yield self._fail(run, error, snapshot)
 
-    def _finish(self, reason: str) -> Iterator[Event]:
-        counters = self.run.counters
-        yield from self.journal.log_updates(last=True)
-        if counters.evaluated_at_update != counters.updates:
-            try:
-                yield self._test()
-            except Stopped:
-                yield from self._stop(untested=True)
-                return
-        yield from self.journal.finish(reason)
+    def _stop(self) -> Told:
+        yield from self._save()
+        for run in self.active:
+            yield run, Interrupted(self.engine.runs[run].counters.steps)

@@ -14,10 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from saclab.algorithm.learner import Learner
 from saclab.algorithm.networks.network import Array
 from saclab.algorithm.policy import Policy
+from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec
+from saclab.training import seeds
 
+REDUCTIONS: dict[str, Callable[..., np.ndarray]] = {"minimum": np.min, "mean": np.mean}
 NEGLIGIBLE = 0.01  # weight γ^n below which what follows a cut-off state is left out
 
 
@@ -33,12 +37,15 @@ class Critics(NamedTuple):
     """f32[C, P]."""
     alpha: float
     discount: float
+    reduction: str
+    """How the policy loss reduces the critics to one Q: the setting actor_reduction."""
 
     def q(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
-        """The smallest of the critics, as the policy sees it: f32[n] for f32[n, O] and f32[n, A]."""
+        """What the policy is trained to raise: f32[n] for f32[n, O] and f32[n, A]."""
         inputs = np.concatenate([observation, action], axis=1)
-        smallest: np.ndarray = np.min([self.q_values(row, inputs) for row in self.critic], axis=0)
-        return smallest
+        each = [self.q_values(row, inputs) for row in self.critic]
+        reduced: np.ndarray = REDUCTIONS[self.reduction](each, axis=0)
+        return reduced
 
 
 class QBias(NamedTuple):
@@ -48,7 +55,7 @@ class QBias(NamedTuple):
     """State-action pairs that were compared."""
     mean_q: float
     mean_return: float
-    """Of the Monte-Carlo soft returns."""
+    """Mean of the Monte-Carlo soft returns."""
     mean_bias: float
     """Mean of (Q − G) / |mean of G|."""
     bias_spread: float
@@ -67,15 +74,35 @@ class Episode(NamedTuple):
     terminated: bool
 
 
+def critics_of(
+    config: Config, learner: Learner, actor: np.ndarray, critic: np.ndarray, log_alpha: np.ndarray | float
+) -> Critics:
+    """The critics of a run, and what their Q stands for."""
+    settings = config.algorithm
+    return Critics(
+        learner.policy, actor, learner.q_values, critic, float(np.exp(np.asarray(log_alpha))), settings.discount,
+        settings.actor_reduction,
+    )  # fmt: skip
+
+
+def q_bias_at(config: Config, critics: Critics, environment: Any, spec: EnvironmentSpec, evaluation: int) -> QBias:
+    """The bias after a run's evaluation number `evaluation`, which says what is drawn."""
+    return measure_q_bias(
+        critics, environment, spec,
+        seeds.integers(config.seed, "q_bias", config.training.q_bias_episodes, evaluation),
+        seeds.generator(config.seed, "q_bias", evaluation),
+    )  # fmt: skip
+
+
 def measure_q_bias(
     critics: Critics,
     environment: Any,
     spec: EnvironmentSpec,
-    seeds: Sequence[int],
+    episode_seeds: Sequence[int],
     generator: np.random.Generator,
 ) -> QBias:
     """Play one episode per seed with the stochastic policy, and compare."""
-    episodes = [play(critics, environment, spec, seed, generator) for seed in seeds]
+    episodes = [play(critics, environment, spec, seed, generator) for seed in episode_seeds]
     known = [known_returns(episode, critics.alpha, critics.discount) for episode in episodes]
     returns = np.concatenate(known)
     q = np.concatenate([

@@ -14,4 +14,4 @@ class Requests:
 
 
 class Stopped(Exception):  # noqa: N818 - no error
-    """Asked to stop in the middle of a test, whose episodes so far count for nothing."""
+    """Asked to stop in the middle of an evaluation, whose episodes so far count for nothing."""

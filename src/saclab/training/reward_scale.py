@@ -40,7 +40,7 @@ class RewardScale:
 
         G ← γ (1 − ended) G + r, as the authors of SimbaV2 have it: the last step of an episode forgets those before.
         """
-        if self.kind == "none":
+        if not self.active:
             return
         self.returns = self.discount * (1 - ended) * self.returns + reward
         count, mean, variance = self.moments
@@ -51,9 +51,14 @@ class RewardScale:
         self.largest = np.maximum(self.largest, np.abs(self.returns).max())
 
     @property
+    def active(self) -> bool:
+        """Whether rewards are divided by anything but 1."""
+        return self.kind != "none"
+
+    @property
     def value(self) -> np.float32:
         """By which rewards are divided now."""
-        if self.kind == "none":
+        if not self.active:
             return np.float32(1)
         variance = self.moments[2]
         if self.kind == "deviation":
@@ -62,7 +67,7 @@ class RewardScale:
 
     def capture(self) -> Arrays:
         """Empty if nothing is scaled."""
-        if self.kind == "none":
+        if not self.active:
             return {}
         return {"returns": self.returns, "moments": self.moments, "largest": self.largest}
 

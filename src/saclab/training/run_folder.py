@@ -5,7 +5,7 @@ metrics.jsonl        one line per window of updates
 episodes.csv         one line per training episode
 evaluations.csv      one line per evaluation, with every episode's return
 checkpoints/         what `saclab resume` continues from
-best/                the policy with the best test return
+best/                the policy with the best evaluation return
 result.json          written when the run has finished
 failure/             what led to its end, if it came to a bad one
 """
@@ -151,7 +151,7 @@ def is_finished(run: Path) -> bool:
 
 
 class Logs:
-    """The three growing files of a run; their lengths are part of a checkpoint."""
+    """The growing files of a run; their lengths are part of a checkpoint."""
 
     def __init__(self, run: Path, evaluation_episodes: int, positions: dict[str, int] | None) -> None:
         """Open for appending, cut back to `positions`, or start anew with header lines if there are none."""

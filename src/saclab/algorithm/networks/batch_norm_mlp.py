@@ -7,8 +7,10 @@ While it learns, a batch is normalised by its own mean and variance; while it ac
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,107 @@ from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, split
 MOMENTUM = 0.99
 EPSILON = 1e-3
 
+Moments = Callable[[int, Array], Any]
+"""(number of a normalisation, its input f32[B, W]) -> the mean and variance f32[W] by which it is normalised."""
+
+
+class Layers(NamedTuple):
+    """The parts of the packed vector."""
+
+    kernels: list[Array]
+    """f32[inputs, outputs] of each dense layer."""
+    last_bias: Array
+    affine: list[Array]
+    """Scale and bias f32[2, W] of each normalisation."""
+    running: list[Array]
+    """Running mean and variance f32[2, W] of each normalisation."""
+
+
+class Shape(NamedTuple):
+    """The sizes of a network and its non-linearity."""
+
+    sizes: tuple[int, ...]
+    """Inputs, hidden layers, outputs."""
+    activation: str
+
+    @property
+    def kernels(self) -> list[tuple[int, int]]:
+        return list(pairwise(self.sizes))
+
+    @property
+    def normalised(self) -> tuple[int, ...]:
+        """Widths of the normalisations."""
+        return self.sizes[:-1]
+
+    @property
+    def packed(self) -> tuple[int, ...]:
+        """Sizes of the parts of the packed vector."""
+        pairs = tuple(2 * width for width in self.normalised)
+        return (*(fan_in * fan_out for fan_in, fan_out in self.kernels), self.sizes[-1], *pairs, *pairs)
+
+    def unpack(self, vector: Array) -> Layers:
+        parts, count = split(vector, self.packed), len(self.kernels)
+        kernels = [part.reshape(shape) for part, shape in zip(parts[:count], self.kernels, strict=True)]
+        pairs = [part.reshape(2, -1) for part in parts[count + 1 :]]
+        return Layers(kernels, parts[count], pairs[:count], pairs[count:])
+
+
+def batch_norm_mlp(
+    inputs: int, hidden_layers: tuple[int, ...], outputs: int, activation: str, projection: str = "none"
+) -> Network:
+    """Kernels start orthogonal (gain √2, that of the last layer 1), biases at 0, scales at 1."""
+    shape = Shape((inputs, *hidden_layers, outputs), activation)
+    project = partial(project_kernels, shape) if projection == "unit_columns" else lambda vector: vector
+    return Network(
+        init=lambda key: project(initial(shape, key)),
+        apply=partial(apply, shape),
+        train=partial(train, shape),
+        project=project,
+        size=sum(shape.packed),
+        statistics=2 * sum(shape.normalised),
+    )
+
+
+def initial(shape: Shape, key: jax.Array) -> jax.Array:
+    keys = jax.random.split(key, len(shape.kernels))
+    gains = [2**0.5] * (len(keys) - 1) + [1.0]
+    kernels = [
+        jax.nn.initializers.orthogonal(gain)(layer_key, kernel, jnp.float32).ravel()
+        for gain, layer_key, kernel in zip(gains, keys, shape.kernels, strict=True)
+    ]
+    affine = [jnp.repeat(jnp.array([1.0, 0.0]), width) for width in shape.normalised]
+    running = [jnp.repeat(jnp.array([0.0, 1.0]), width) for width in shape.normalised]
+    return jnp.concatenate([*kernels, jnp.zeros(shape.sizes[-1]), *affine, *running])
+
+
+def apply(shape: Shape, vector: Array, *inputs: Array) -> Array:
+    """As it acts: by the running moments."""
+    layers = shape.unpack(vector)
+    return forward(shape, layers, inputs, lambda number, x: layers.running[number])
+
+
+def train(shape: Shape, vector: jax.Array, *inputs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """As it learns: by the moments of the batch, towards which the running ones move."""
+    layers, moved = shape.unpack(vector), []
+
+    def moments(number: int, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mean, variance = jnp.mean(x, axis=0), jnp.var(x, axis=0)
+        seen = jnp.stack([mean, variance])
+        moved.append((MOMENTUM * layers.running[number] + (1 - MOMENTUM) * seen).ravel())
+        return mean, variance
+
+    outputs = forward(shape, layers, inputs, moments)
+    return outputs, jax.lax.stop_gradient(jnp.concatenate(moved))
+
+
+def forward(shape: Shape, layers: Layers, inputs: tuple[Array, ...], moments: Moments) -> Array:
+    nonlinearity = ACTIVATIONS[shape.activation]
+    x = inputs[0].__array_namespace__().concat(inputs, axis=-1)
+    for number, kernel in enumerate(layers.kernels):
+        x = normalise(x, *moments(number, x), *layers.affine[number])
+        x = (x if number == 0 else nonlinearity(x)) @ kernel
+    return x + layers.last_bias
+
 
 def normalise(x: Array, mean: Array, variance: Array, scale: Array, bias: Array) -> Array:
     """(x − mean) / √(variance + ε) · scale + bias, by the last axis."""
@@ -25,68 +128,9 @@ def normalise(x: Array, mean: Array, variance: Array, scale: Array, bias: Array)
     return (x - mean) / xp.sqrt(variance + EPSILON) * scale + bias
 
 
-def batch_norm_mlp(
-    inputs: int, hidden_layers: tuple[int, ...], outputs: int, activation: str, projection: str = "none"
-) -> Network:
-    """Kernels start orthogonal (gain √2, that of the last layer 1), biases at 0, scales at 1."""
-    kernels = list(pairwise((inputs, *hidden_layers, outputs)))
-    widths = (inputs, *hidden_layers)  # of the normalisations
-    sizes = (
-        *(fan_in * fan_out for fan_in, fan_out in kernels), outputs,
-        *(2 * width for width in widths), *(2 * width for width in widths),
-    )  # fmt: skip
-    count, statistics = len(kernels), 2 * sum(widths)
-    nonlinearity = ACTIVATIONS[activation]
-
-    def parts_of(vector: Array) -> tuple[list[Array], Array, list[Array], list[Array]]:
-        """Kernels, the last bias, scale and bias f32[2, W] and running mean and variance f32[2, W] of each layer."""
-        parts = split(vector, sizes)
-        pairs = [part.reshape(2, -1) for part in parts[count + 1 :]]
-        weights = [part.reshape(shape) for part, shape in zip(parts[:count], kernels, strict=True)]
-        return weights, parts[count], pairs[:count], pairs[count:]
-
-    def init(key: jax.Array) -> jax.Array:
-        keys = jax.random.split(key, count)
-        gains = [2**0.5] * (count - 1) + [1.0]
-        weights = [
-            jax.nn.initializers.orthogonal(gain)(layer_key, shape, jnp.float32).ravel()
-            for gain, layer_key, shape in zip(gains, keys, kernels, strict=True)
-        ]
-        affine = [jnp.concatenate([jnp.ones(width), jnp.zeros(width)]) for width in widths]
-        running = [jnp.concatenate([jnp.zeros(width), jnp.ones(width)]) for width in widths]
-        return project(jnp.concatenate([*weights, jnp.zeros(outputs), *affine, *running]))
-
-    def forward(vector: Array, inputs: tuple[Array, ...], moments: Any) -> Array:
-        """`moments(layer, x)` gives the mean and variance f32[W] by which a layer is normalised."""
-        weights, last_bias, affine, _ = parts_of(vector)
-        x = inputs[0].__array_namespace__().concat(inputs, axis=-1)
-        for layer in range(count):
-            x = normalise(x, *moments(layer, x), *affine[layer])
-            x = (x if layer == 0 else nonlinearity(x)) @ weights[layer]
-        return x + last_bias
-
-    def apply(vector: Array, *inputs: Array) -> Array:
-        running = parts_of(vector)[3]
-        return forward(vector, inputs, lambda layer, x: running[layer])
-
-    def train(vector: jax.Array, *inputs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        running, moved = parts_of(vector)[3], []
-
-        def moments(layer: int, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-            mean, variance = jnp.mean(x, axis=0), jnp.var(x, axis=0)
-            seen = jax.lax.stop_gradient(jnp.stack([mean, variance]))
-            moved.append((MOMENTUM * running[layer] + (1 - MOMENTUM) * seen).ravel())
-            return mean, variance
-
-        outputs = forward(vector, inputs, moments)
-        return outputs, jax.lax.stop_gradient(jnp.concatenate(moved))
-
-    def project(vector: jax.Array) -> jax.Array:
-        if projection == "none":
-            return vector
-        parts = split(vector, sizes)
-        for number, shape in enumerate(kernels):
-            parts[number] = unit_columns(parts[number].reshape(shape)).ravel()
-        return jnp.concatenate(parts)
-
-    return Network(init, apply, train, project, sum(sizes), statistics)
+def project_kernels(shape: Shape, vector: jax.Array) -> jax.Array:
+    """The vector f32[P] with unit columns in each kernel."""
+    parts = split(vector, shape.packed)
+    for number, kernel in enumerate(shape.kernels):
+        parts[number] = unit_columns(parts[number].reshape(kernel)).ravel()
+    return jnp.concatenate(parts)

@@ -1,4 +1,4 @@
-"""The arrays through which the processes of a batch exchange steps: shared memory that no crash leaves behind."""
+"""The arrays through which the processes of a run group exchange steps: shared memory that no crash leaves behind."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from saclab.replay import RowLayout
 class Sizes(NamedTuple):
     runs: int
     environments: int
-    """Of each run."""
-    observation_size: int
-    action_size: int
+    """Environments of each run."""
+    layout: RowLayout
+    """Columns of a transition."""
 
 
-class Board:
+class SharedBuffers:
     """N = runs × environments; the environments of run r are at [r · environments, (r + 1) · environments)."""
 
     def __init__(self, sizes: Sizes, file_descriptor: int | None = None) -> None:
         """Shared memory filled with zeros, or that of another process."""
         self.sizes = sizes
         total = sizes.runs * sizes.environments
-        width = RowLayout(sizes.observation_size, sizes.action_size).width
+        layout = sizes.layout
         shapes: dict[str, tuple[tuple[int, ...], type]] = {
             "total_reward": ((total,), np.float64),
             "length": ((total,), np.int64),
-            "action": ((total, sizes.action_size), np.float32),
-            "row": ((total, width), np.float32),
-            "observation": ((total, sizes.observation_size), np.float32),
+            "action": ((total, layout.action_size), np.float32),
+            "row": ((total, layout.width), np.float32),
+            "observation": ((total, layout.observation_size), np.float32),
             "ended": ((total,), np.bool_),
             "terminated": ((total,), np.bool_),
             "active": ((sizes.runs,), np.bool_),
@@ -68,7 +68,7 @@ class Board:
         self.active = arrays["active"]
         """bool[runs]: the others are not stepped."""
         self.stop = arrays["stop"]
-        """bool[1]: break off the test."""
+        """bool[1]: break off the evaluation."""
 
     def close(self) -> None:
         os.close(self.file_descriptor)

@@ -1,0 +1,319 @@
+"""The settings of an algorithm and of a training: one docstring per field, checked when they are built.
+
+This file imports no numerical library, so that `saclab --help` stays fast.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
+
+from saclab.errors import SettingError, unknown_name
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+
+def require(condition: bool, setting: str, value: object, way_out: str) -> None:
+    """Raise a SettingError that names the setting, its value and what would work, unless `condition` holds."""
+    if not condition:
+        raise SettingError(setting, value, way_out)
+
+
+PLAIN_NUMBER = "plain number"
+Real = Annotated[float, PLAIN_NUMBER]
+"""A setting that is an argument of the compiled update: another value needs no compilation, and runs that differ in
+such settings only can be trained as one group."""
+Whole = Annotated[int, PLAIN_NUMBER]
+
+Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
+NetworkName = Literal["mlp", "batch_norm_mlp"]
+Reduction = Literal["minimum", "mean"]
+UPDATES = ("critic", "actor", "temperature", "targets")
+
+
+@dataclass(frozen=True)
+class AlgorithmSettings:
+    """One point in the space of SAC variants. Defaults: Table 1 of the paper, plain SAC."""
+
+    discount: Real = 0.99
+    """γ: weight of the next state's value, in [0, 1)."""
+    batch_size: int = 256
+    """Transitions per update."""
+    critic_learning_rate: Real = 3e-4
+    """Adam's learning rate for the Q-networks."""
+    actor_learning_rate: Real = 3e-4
+    """Adam's learning rate for the policy."""
+    adam_beta_1: Real = 0.9
+    """Decay of Adam's first moment, of all that is trained."""
+    adam_beta_2: Real = 0.999
+    """Decay of Adam's second moment, of all that is trained."""
+    learning_rate_schedule: Literal["constant", "linear", "cosine"] = "constant"
+    """How the three learning rates go from their values to `final_learning_rate_share` of them over the run's updates.
+    Each counts the steps of its own optimizer."""
+    final_learning_rate_share: Real = 1.0
+    """What is left of the learning rates at the end of the schedule, in [0, 1]."""
+
+    network: NetworkName = "mlp"
+    """Architecture of the policy, and of the Q-networks unless `critic_network` says another."""
+    critic_network: NetworkName | None = None
+    """Architecture of the Q-networks; None is `network`."""
+    hidden_layers: tuple[int, ...] = (256, 256)
+    """Units of each hidden layer of the policy, and of the Q-networks unless `critic_hidden_layers` says others."""
+    critic_hidden_layers: tuple[int, ...] | None = None
+    """Units of each hidden layer of the Q-networks; None is `hidden_layers`."""
+    activation: Activation = "relu"
+    """Non-linearity after each hidden layer."""
+    weight_projection: Literal["none", "unit_columns"] = "none"
+    """What is done to the weight matrices after each step: nothing, or the weights into each unit are scaled to
+    length 1."""
+    critics: int = 2
+    """Q-networks that are trained side by side."""
+    critic_head: Literal["scalar", "categorical"] = "scalar"
+    """What a Q-network predicts: a number, or a distribution over `critic_atoms` values."""
+    critic_atoms: int = 101
+    """Values of the categorical head, evenly spaced from −`critic_bound` to `critic_bound`."""
+    critic_bound: float = 5.0
+    """The largest value that the categorical head can represent."""
+    joint_forward: bool = False
+    """Whether the critics see (s, a) and (s′, a′) in one pass, so that batch statistics are those of both."""
+
+    polyak_rate: Real = 0.005
+    """τ: share of the critic that enters its target at each update (Eq. 2)."""
+    snapshots: int = 1
+    """K: target snapshots over which the next state's value is averaged (Eq. 9). 1 is plain SAC, 0 has no target
+    network: the critics themselves value the next state."""
+    snapshot_interval: Whole = 1
+    """Updates between two target snapshots. 1 is the literal Eq. 9."""
+    entropy_window: int = 1
+    """Minibatches over which α·log π of the target is averaged row by row, from zeros: what the paper's authors
+    ran as "Averaged-SAC". The rows are unrelated to each other; this is not Eq. 9. 1 is plain SAC."""
+    target_reduction: Reduction = "minimum"
+    """How the critics are reduced to one Q in the target (Eq. 4)."""
+    actor_reduction: Reduction = "minimum"
+    """How the critics are reduced to one Q in the policy loss (Eq. 5)."""
+
+    update_order: tuple[str, ...] = UPDATES
+    """Order of the parts of an update; each sees what those before it have changed."""
+    actor_interval: int = 1
+    """Updates between two updates of the policy and the temperature."""
+
+    temperature: Literal["fixed", "learned"] = "fixed"
+    """Whether α is fixed or learned by dual descent (Eq. 8)."""
+    initial_temperature: Real = 0.2
+    """α, or its first value if it is learned."""
+    temperature_learning_rate: Real = 3e-4
+    """Adam's learning rate for log α, if it is learned."""
+    temperature_gradient: Literal["log_alpha", "alpha"] = "log_alpha"
+    """The factor before (−log π − target entropy) in the temperature loss: log α (the paper's authors,
+    Stable-Baselines3) or α itself (Eq. 8 to the letter, CleanRL). Adam moves log α in both cases."""
+    target_entropy: Annotated[float | None, PLAIN_NUMBER] = None
+    """Entropy that the learned temperature holds the policy to, in nats; None is −dim(A)."""
+    log_std_minimum: float = -20.0
+    """Lower clip of the policy's log standard deviation."""
+    log_std_maximum: float = 2.0
+    """Upper clip of the policy's log standard deviation."""
+
+    longest_noise: int = 1
+    """Most steps for which one draw of the exploration noise is held; how many, n, is drawn with a probability
+    proportional to n⁻². 1 is a draw for each step."""
+    reward_terms: tuple[str, ...] = ()
+    """Names of reward terms in the `info` of an environment's step; what they leave of the reward is a term too."""
+    reward_weights: Annotated[tuple[float, ...], PLAIN_NUMBER] = ()
+    """The weight of each of `reward_terms` in the reward that is learned from; the remainder's is 1. None given: 1 for
+    each. Evaluations always count the environment's own reward."""
+    reward_scaling: Literal["none", "deviation", "deviation_or_bound"] = "none"
+    """What rewards are divided by when a batch is drawn: nothing, the running standard deviation of the discounted
+    return, or the larger of it and the largest discounted return so far divided by `critic_bound`."""
+
+    def __post_init__(self) -> None:
+        require_ranges(self)
+        require_possible(self)
+
+    @property
+    def layers_of_critic(self) -> tuple[int, ...]:
+        return self.hidden_layers if self.critic_hidden_layers is None else self.critic_hidden_layers
+
+    @property
+    def network_of_critic(self) -> NetworkName:
+        return self.network if self.critic_network is None else self.critic_network
+
+
+def require_ranges(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for a value that cannot work whatever the others are."""
+
+    def check(name: str, condition: Callable[[Any], bool], way_out: str) -> None:
+        require(condition(getattr(settings, name)), name, getattr(settings, name), way_out)
+
+    check("discount", lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.99")
+    check("polyak_rate", lambda value: 0 < value <= 1, "use a value in (0, 1], such as 0.005")
+    check("snapshots", lambda value: value >= 0, "use a whole number, of 0 for no target network")
+    check("critic_atoms", lambda value: value >= 2, "use a whole number of at least 2, such as 101")
+    check("critic_bound", lambda value: value > 0, "use a value above 0, such as 5")
+    check("final_learning_rate_share", lambda value: 0 <= value <= 1, "use a value in [0, 1], such as 0.5")
+    for name in ("batch_size", "critics", "snapshot_interval", "entropy_window", "actor_interval", "longest_noise"):
+        check(name, lambda value: value >= 1, "use a whole number of at least 1")
+    for name in ("critic_learning_rate", "actor_learning_rate", "temperature_learning_rate"):
+        check(name, lambda value: 0 <= value < 1, "use a value in [0, 1), such as 3e-4")
+    for name in ("adam_beta_1", "adam_beta_2"):
+        check(name, lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.9")
+    for name in ("hidden_layers", "critic_hidden_layers"):
+        check(
+            name,
+            lambda layers: layers is None or (len(layers) > 0 and min(layers) >= 1),
+            "use one or more positive widths, such as 256 256",
+        )
+
+
+def require_possible(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for values that cannot work together."""
+    lowest_allowed = "above 0" if settings.temperature == "learned" else "of at least 0"
+    require(
+        settings.initial_temperature > 0 or (settings.temperature == "fixed" and settings.initial_temperature == 0),
+        "initial_temperature", settings.initial_temperature, f"use a value {lowest_allowed}, such as 0.2",
+    )  # fmt: skip
+    require(
+        settings.log_std_minimum < settings.log_std_maximum,
+        "log_std_minimum", settings.log_std_minimum, f"use a value below log_std_maximum {settings.log_std_maximum}",
+    )  # fmt: skip
+    require(
+        settings.snapshots <= 1 or settings.entropy_window == 1,
+        "entropy_window", settings.entropy_window,
+        f"use 1 together with snapshots {settings.snapshots}: averaging values (Eq. 9) and averaging the entropy "
+        "term are two different algorithms",
+    )  # fmt: skip
+    require(
+        settings.critic_head != "categorical" or settings.entropy_window == 1,
+        "entropy_window", settings.entropy_window,
+        "use 1 together with critic_head categorical: it averages numbers, not distributions",
+    )  # fmt: skip
+    require(
+        len(settings.reward_weights) in (0, len(settings.reward_terms)),
+        "reward_weights", " ".join(map(str, settings.reward_weights)),
+        f"give one for each of the {len(settings.reward_terms)} reward_terms, or none",
+    )  # fmt: skip
+    order = settings.update_order
+    require(
+        sorted(order) == sorted(UPDATES) and order.index("actor") < order.index("temperature"),
+        "update_order", " ".join(order),
+        f"name each of {', '.join(UPDATES)} once, and actor before temperature, which is judged by its entropy",
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a run goes: how much experience, how many updates, when it is tested, when it stops."""
+
+    parallel_environments: int = 1
+    """Training environments stepped in turn. The update-to-data ratio does not depend on it: steps are counted
+    over all environments."""
+    random_steps: int = 10_000
+    """Environment steps with uniformly random actions before the first update."""
+    update_interval: int = 1
+    """N: environment steps between two rounds of updates."""
+    updates_per_interval: int = 1
+    """Updates in each round; updates_per_interval / update_interval is the update-to-data ratio."""
+    acting_delay: int = 0
+    """Rounds of updates by which the policy that acts is behind: 0 is the textbook's, 1 lets the environments be
+    stepped while a round is computed, which saves time where there is more than one core."""
+    replay_capacity: int = 1_000_000
+    """Transitions that the replay buffer holds; the oldest is overwritten."""
+
+    max_steps: int | None = None
+    """Stop after so many environment steps."""
+    max_updates: int | None = None
+    """Stop after so many updates."""
+    max_episodes: int | None = None
+    """Stop after so many training episodes."""
+    patience_episodes: int | None = None
+    """Stop after so many training episodes without a better test return."""
+
+    evaluation_interval_episodes: int | None = None
+    """Test the policy after so many training episodes."""
+    evaluation_interval_steps: int | None = None
+    """Test the policy after so many environment steps."""
+    evaluation_episodes: int = 10
+    """Episodes of one test, with the deterministic policy (tanh of the mean), stepped side by side."""
+    q_bias_episodes: int = 0
+    """Episodes of the stochastic policy after each test, from which the critics' bias is estimated; 0 for none."""
+    log_interval: int = 200
+    """Updates that are averaged into one line of metrics.jsonl."""
+
+    def __post_init__(self) -> None:
+        positive = ("parallel_environments", "update_interval", "updates_per_interval", "replay_capacity",
+                    "evaluation_episodes", "log_interval")  # fmt: skip
+        for name in positive:
+            require(getattr(self, name) >= 1, name, getattr(self, name), "use a whole number of at least 1")
+        optional = ("max_steps", "max_updates", "max_episodes", "patience_episodes",
+                    "evaluation_interval_episodes", "evaluation_interval_steps")  # fmt: skip
+        for name in optional:
+            value = getattr(self, name)
+            require(value is None or value >= 1, name, value, "use a whole number of at least 1, or leave it out")
+        require(self.acting_delay in (0, 1), "acting_delay", self.acting_delay, "use 0 or 1")
+        for name in ("random_steps", "q_bias_episodes"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "use 0 or more")
+        require(
+            (self.max_steps, self.max_updates, self.max_episodes) != (None, None, None),
+            "max_steps", None, "give at least one of max_steps, max_updates and max_episodes",
+        )  # fmt: skip
+        require(
+            (self.evaluation_interval_episodes is None) != (self.evaluation_interval_steps is None),
+            "evaluation_interval_episodes", self.evaluation_interval_episodes,
+            f"give exactly one of it and evaluation_interval_steps (now {self.evaluation_interval_steps}), "
+            "and None for the other",
+        )  # fmt: skip
+
+    @property
+    def update_to_data_ratio(self) -> float:
+        """Updates per environment step."""
+        return self.updates_per_interval / self.update_interval
+
+    def updates_due(self, steps: int) -> int:
+        """Updates that should have been made once `steps` environment steps are done."""
+        rounds = max(0, steps - self.random_steps) // self.update_interval
+        due = rounds * self.updates_per_interval
+        return due if self.max_updates is None else min(due, self.max_updates)
+
+
+Settings = TypeVar("Settings", AlgorithmSettings, TrainingSettings)
+
+
+def field_names(settings: type[DataclassInstance]) -> tuple[str, ...]:
+    """Names of the settings in a dataclass."""
+    return tuple(entry.name for entry in dataclasses.fields(settings))
+
+
+def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settings:
+    """`settings` with some values changed; raises for a name that is not one of its settings."""
+    known = field_names(type(settings))
+    for name in overrides:
+        if name not in known:
+            raise unknown_name("setting", name, known)
+    return dataclasses.replace(settings, **overrides)
+
+
+def algorithm_from_json(values: Mapping[str, Any]) -> AlgorithmSettings:
+    """The settings in a JSON object, where tuples are lists; raises SettingError for one that does not exist."""
+    return replace_settings(
+        AlgorithmSettings(),
+        {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()},
+    )
+
+
+@lru_cache(maxsize=1)
+def plain_numbers() -> tuple[str, ...]:
+    """Names of the settings that are arguments of the compiled update."""
+    hints = get_type_hints(AlgorithmSettings, include_extras=True)
+    return tuple(name for name, hint in hints.items() if PLAIN_NUMBER in getattr(hint, "__metadata__", ()))
+
+
+def structure(settings: AlgorithmSettings) -> AlgorithmSettings:
+    """`settings` with all plain numbers at their defaults: what a compiled program depends on.
+
+    Whether α is learned is a plain number too: the learning rate of a fixed one is 0.
+    """
+    defaults = {name: getattr(AlgorithmSettings, name) for name in plain_numbers()}
+    return dataclasses.replace(settings, temperature="learned", **defaults)

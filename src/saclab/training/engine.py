@@ -1,0 +1,137 @@
+"""What steps environments and computes updates: the interface that the loop, saving and resuming are written for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from saclab.config import Config
+from saclab.environments.make import EnvironmentSpec, environment_spec, make_environment
+from saclab.environments.vector import EndedEpisode
+from saclab.errors import RunBroken
+from saclab.replay import RowLayout
+from saclab.training.checkpoint import Checkpoint, CheckpointError
+from saclab.training.evaluation import EvaluationEpisodes
+from saclab.training.q_bias import QBias
+from saclab.training.run_state import RunState
+from saclab.training.snapshot import EnvironmentStates, Snapshot, Start, new_start
+
+
+class Broken(NamedTuple):
+    """A run that cannot go on."""
+
+    error: RunBroken
+    snapshot: Snapshot
+    """The run before the step that broke it; to be looked at before anything else is asked of the engine."""
+
+
+class StepResult(NamedTuple):
+    ended: Mapping[int, Sequence[EndedEpisode]]
+    """Run -> the episodes that ended; runs without one may be missing."""
+    broken: Mapping[int, Broken]
+    """Runs whose environment broke. They have to be dropped."""
+
+
+NOTHING_HAPPENED = StepResult({}, {})
+
+
+class Engine(Protocol):
+    """R runs that take their steps together. A run is named by its place in `runs`."""
+
+    @property
+    def runs(self) -> Sequence[RunState]:
+        """What belongs to each run on the host; the engine counts steps and updates there, the loop all else."""
+
+    def step(self) -> StepResult:
+        """Step every environment once, store the transitions, make the updates due."""
+
+    def deliver_metrics(self) -> None:
+        """Bring the metrics of all updates that were made into the runs' windows."""
+
+    def evaluate(
+        self, runs: Sequence[int], should_stop: Callable[[], bool]
+    ) -> Mapping[int, EvaluationEpisodes | RunBroken]:
+        """Evaluate the policies of these runs as they are now: the episodes of each, or what broke in them.
+
+        Raises:
+            Stopped: when `should_stop`; the runs are as before.
+        """
+
+    def measure_q_bias(self, runs: Sequence[int]) -> Mapping[int, QBias | RunBroken]:
+        """How far the critics are from Monte-Carlo soft returns, as after the last evaluation, or what broke.
+
+        Runs that do not want it are missing.
+        """
+
+    def actor(self, run: int) -> np.ndarray:
+        """The policy's parameters f32[P] on the host, after every update that was made."""
+
+    def snapshot(self, run: int) -> Snapshot:
+        """The run as it is now, after every update that was made."""
+
+    def capture_environments(self, run: int) -> EnvironmentStates:
+        """The exact state of each environment of a run; None where it cannot be captured."""
+
+    def drop(self, run: int) -> None:
+        """Go on without a run that has finished or failed."""
+
+    def close(self) -> None: ...
+
+
+class EngineBuilder(Protocol):
+    """What an engine will be made of: all that can be refused is refused before a run folder is touched.
+
+    It builds one engine, with the replay buffers into which it has read checkpoints before.
+    """
+
+    @property
+    def configs(self) -> Sequence[Config]: ...
+
+    @property
+    def spec(self) -> EnvironmentSpec: ...
+
+    @property
+    def layout(self) -> RowLayout: ...
+
+    @property
+    def slots(self) -> int:
+        """Runs for which the compiled program has room; 0 for a run alone."""
+
+    def read(self, run: int, path: Path) -> Checkpoint:
+        """Read a checkpoint of a run, its transitions into the run's replay buffer.
+
+        Raises:
+            CheckpointError: if it is not whole.
+        """
+
+    def build(self, starts: Sequence[Start]) -> Engine:
+        """The engine of these runs.
+
+        Raises:
+            EnvironmentStateError: if the environments' states cannot be restored.
+        """
+
+
+class EnvironmentStateError(CheckpointError):
+    """The environments' states in a checkpoint do not fit the environments."""
+
+    def __init__(self, run: int, reason: object) -> None:
+        super().__init__(f"the checkpoint's state of the environments does not fit: {reason}")
+        self.run = run
+
+
+def spec_of(config: Config) -> EnvironmentSpec:
+    """What a learner must know of a run's environment; raises UserError if it cannot be trained on."""
+    environment = make_environment(config.environment, config.environment_arguments)
+    try:
+        return environment_spec(config.environment, environment)
+    finally:
+        environment.close()
+
+
+def build_new(builder: EngineBuilder) -> Engine:
+    """The engine of new runs."""
+    return builder.build([new_start(config, builder.layout) for config in builder.configs])

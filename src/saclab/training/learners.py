@@ -1,0 +1,97 @@
+"""Learners as training deals with them: compiled once, taken apart into named arrays, and put together again.
+
+Together with `batch/program.py` and the policies of `batch/worker.py` this is all that asks the algorithm room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from saclab.algorithm.learner import Learner, make_learner
+from saclab.algorithm.scalars import Scalars, scalars
+from saclab.algorithm.types import Context, LearnerState
+from saclab.config import Config
+from saclab.errors import NonFiniteError
+from saclab.replay import RowLayout
+from saclab.settings import AlgorithmSettings, structure
+from saclab.training import seeds
+from saclab.training.captured import require_like
+
+
+def learner_of(settings: AlgorithmSettings, layout: RowLayout) -> Learner:
+    return make_learner(settings, layout.observation_size, layout.action_size)
+
+
+def numbers_of(config: Config, layout: RowLayout) -> Scalars:
+    """The plain numbers of a run, as arguments of what is compiled."""
+    return scalars(config.algorithm, layout.action_size, config.planned_updates)
+
+
+def reward_weights(settings: AlgorithmSettings) -> np.ndarray:
+    """f32[T]: the weight of each reward term in the reward that is learned from; the remainder's is 1."""
+    named = settings.reward_weights or [1.0] * len(settings.reward_terms)
+    return np.array([*named, 1.0], np.float32)
+
+
+def initial_learner(config: Config, layout: RowLayout) -> LearnerState:
+    """The state before a run's first update."""
+    init = compiled_init(structure(config.algorithm), layout)
+    return init(numbers_of(config, layout), seeds.learner_key(config.seed))
+
+
+@lru_cache(maxsize=16)
+def compiled_init(shape: AlgorithmSettings, layout: RowLayout) -> Callable[[Scalars, np.ndarray], LearnerState]:
+    """(plain numbers, key u32[2]) -> the state before the first update; compiled once for all of a `structure`."""
+    return jax.jit(learner_of(shape, layout).init)
+
+
+@lru_cache(maxsize=16)
+def compiled_update(
+    shape: AlgorithmSettings, layout: RowLayout
+) -> Callable[[Scalars, LearnerState, np.ndarray, Context], tuple[LearnerState, jax.Array]]:
+    """(plain numbers, state, rows f32[B, width], context) -> (state, report f32[M]); the state given is used up.
+
+    Compiled once for all settings of a `structure`.
+    """
+    learner = learner_of(shape, layout)
+
+    def update(
+        numbers: Scalars, state: LearnerState, rows: jax.Array, context: Context
+    ) -> tuple[LearnerState, jax.Array]:
+        state = learner.update(numbers, state, layout.unpack(rows), context)
+        return state, state.report
+
+    return jax.jit(update, donate_argnums=1)
+
+
+def on_device(tree: Any) -> Any:
+    """Host arrays as JAX's, so that a call need not bring them each time."""
+    return jax.tree.map(jnp.asarray, tree)
+
+
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """The arrays of a pytree by their path, such as `.actor.moments.mu`."""
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def finite_arrays(learner: LearnerState, updates: int) -> dict[str, np.ndarray]:
+    """The learner's arrays by name; raises NonFiniteError if it is not worth continuing from."""
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()}
+    for name, array in arrays.items():
+        zero_temperature = name == ".temperature.weights" and array == -np.inf
+        if not (np.isfinite(array).all() or zero_temperature):
+            raise NonFiniteError(f"after update {updates} {name} is not finite")
+    return arrays
+
+
+def learner_from(arrays: Mapping[str, np.ndarray], example: LearnerState) -> LearnerState:
+    """The learner whose arrays these are by name; raises CheckpointError unless they are like the example's."""
+    checked = [require_like(name, arrays.get(name), np.asarray(leaf)) for name, leaf in named_leaves(example).items()]
+    restored: LearnerState = jax.tree.unflatten(jax.tree.structure(example), checked)
+    return restored

@@ -1,0 +1,185 @@
+"""The engine of a run alone: its environments and replay buffer in this process, one update per call into XLA."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from saclab.algorithm.types import Context
+from saclab.config import Config
+from saclab.environments.vector import TrainingEnvironments
+from saclab.errors import NonFiniteError, RunBroken
+from saclab.replay import ReplayBuffer, layout_of, require_memory
+from saclab.settings import structure
+from saclab.training import seeds
+from saclab.training.checkpoint import Checkpoint, read_checkpoint
+from saclab.training.engine import NOTHING_HAPPENED, Broken, EnvironmentStateError, StepResult, spec_of
+from saclab.training.evaluation import EvaluationEpisodes, Evaluator
+from saclab.training.learners import compiled_update, learner_of, numbers_of, on_device, reward_weights
+from saclab.training.q_bias import QBias, critics_of, q_bias_at
+from saclab.training.requests import Stopped
+from saclab.training.snapshot import EnvironmentStates, Snapshot, Start, new_start
+
+
+class LocalBuilder:
+    """An `EngineBuilder` of a run alone."""
+
+    slots = 0
+
+    def __init__(self, config: Config) -> None:
+        """Make room for its replay buffer.
+
+        Raises:
+            UserError: if the environment cannot be trained on, or the replay buffer does not fit in memory.
+        """
+        self.configs = [config]
+        self.spec = spec_of(config)
+        self.layout = layout_of(self.spec, config.algorithm)
+        require_memory(config.training.replay_capacity, self.layout)
+        self.replay = ReplayBuffer(config.training.replay_capacity, self.layout)
+
+    def read(self, run: int, path: Path) -> Checkpoint:
+        return read_checkpoint(path, self.replay)
+
+    def build(self, starts: Sequence[Start]) -> LocalEngine:
+        return LocalEngine(starts[0], self.replay)
+
+
+class LocalEngine:
+    """An `Engine` of one run. `step` is one step of every training environment and the updates that fall due."""
+
+    def __init__(self, start: Start, replay: ReplayBuffer) -> None:
+        """Go on from `start`, whose transitions are in the replay buffer.
+
+        Raises:
+            EnvironmentStateError: if the environments' states cannot be restored.
+        """
+        self.run, self.replay = start.run, replay
+        self.runs = [start.run]
+        config = start.run.config
+        self.environments = restored_environments(start)
+        self.spec = self.environments.spec
+        self.evaluator = Evaluator(config.environment, config.environment_arguments)
+        self.learner = learner_of(config.algorithm, replay.layout)
+        self.policy = self.learner.policy
+        self.update = compiled_update(structure(config.algorithm), replay.layout)
+        self.numbers = on_device(numbers_of(config, replay.layout))
+        self.reward_weights = reward_weights(config.algorithm)
+        self.context = on_device(Context(np.int32(0), self.reward_weights, self.run.reward_scale.value))
+        self.learner_state = on_device(start.learner)
+        self._actor: np.ndarray | None = None
+        self._actor_before = start.behaviour
+
+    @classmethod
+    def new(cls, config: Config) -> LocalEngine:
+        """The engine of a run before its first step."""
+        builder = LocalBuilder(config)
+        return builder.build([new_start(config, builder.layout)])
+
+    def step(self) -> StepResult:
+        run, counters = self.run, self.run.counters
+        try:
+            transitions, ended = self.environments.step(self._next_action())
+        except NonFiniteError as error:
+            return StepResult({}, {0: Broken(error, self.snapshot(0))})
+        self.replay.add(transitions)
+        if run.reward_scale.active:
+            last = np.isin(np.arange(len(self.environments)), [episode.environment for episode in ended])
+            run.reward_scale.enter(transitions.reward_terms @ self.reward_weights, last)
+            self.context = self.context._replace(reward_scale=run.reward_scale.value)
+        counters.steps += len(self.environments)
+        updates_due = run.config.training.updates_due(counters.steps)
+        if counters.updates < updates_due:
+            self._actor_before = self.actor(0)
+        while counters.updates < updates_due:
+            rows = self.replay.sample(run.sampling, run.config.algorithm.batch_size)
+            context = self.context._replace(step=np.int32(counters.updates))
+            self.learner_state, metrics = self.update(self.numbers, self.learner_state, rows, context)
+            run.window.append(metrics)
+            counters.updates += 1
+            self._actor = None
+        return StepResult({0: ended}, {}) if ended else NOTHING_HAPPENED
+
+    def _next_action(self) -> np.ndarray:
+        """f32[N, A] in [-1, 1]: uniform during the random steps, then a sample of the policy."""
+        if self.run.exploring():
+            return self.run.exploration.uniform_action()
+        noise = self.run.exploration.noise()
+        action: np.ndarray = self.policy.act(self.behaviour, self.environments.observation, noise)
+        return action
+
+    def actor(self, run: int) -> np.ndarray:
+        """The policy's parameters f32[P] on the host, copied once per update."""
+        if self._actor is None:
+            self._actor = np.array(self.learner_state.actor.weights)
+        return self._actor
+
+    @property
+    def behaviour(self) -> np.ndarray:
+        """The parameters f32[P] that choose the actions: with a delay, those before the last round of updates.
+
+        Nothing has to wait then for the round, which XLA computes while the environments are stepped.
+        """
+        if self.run.config.training.acting_delay == 0 or self._actor_before is None:
+            return self.actor(0)
+        return self._actor_before
+
+    def deliver_metrics(self) -> None:
+        """They are in the window already."""
+
+    def evaluate(
+        self, runs: Sequence[int], should_stop: Callable[[], bool] = lambda: False
+    ) -> Mapping[int, EvaluationEpisodes | RunBroken]:
+        actor = self.actor(0)
+
+        def act(observation: np.ndarray) -> np.ndarray:
+            if should_stop():
+                raise Stopped
+            action: np.ndarray = self.policy.mode(actor, observation)
+            return action
+
+        try:
+            return {0: self.evaluator.run(act, self.run.evaluation_seeds())}
+        except NonFiniteError as error:
+            return {0: error}
+
+    def measure_q_bias(self, runs: Sequence[int]) -> Mapping[int, QBias | RunBroken]:
+        config, state = self.run.config, self.learner_state
+        if config.training.q_bias_episodes == 0:
+            return {}
+        critics = critics_of(
+            config, self.learner, self.actor(0), np.array(state.critic.weights), np.asarray(state.temperature.weights)
+        )
+        environment, number = self.evaluator.environments[0], self.run.counters.evaluations
+        return {0: q_bias_at(config, critics, environment, self.spec, number)}
+
+    def snapshot(self, run: int) -> Snapshot:
+        return Snapshot(self.run, self.learner_state, self.behaviour, self.environments.observation, self.replay)
+
+    def capture_environments(self, run: int) -> EnvironmentStates:
+        return self.environments.capture()
+
+    def drop(self, run: int) -> None:
+        """Nothing is left to go on with."""
+
+    def close(self) -> None:
+        self.environments.close()
+        self.evaluator.close()
+
+
+def restored_environments(start: Start) -> TrainingEnvironments:
+    """The training environments of a run, in their first episodes or in those of the checkpoint."""
+    config = start.run.config
+    first_seeds = seeds.integers(config.seed, "environments", config.training.parallel_environments)
+    environments = TrainingEnvironments(
+        config.environment, config.environment_arguments, first_seeds, config.algorithm.reward_terms
+    )
+    if start.environments is not None:
+        try:
+            environments.restore(start.environments, start.run.restart_seeds())
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
+            environments.close()
+            raise EnvironmentStateError(0, error) from error
+    return environments

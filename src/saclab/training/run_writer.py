@@ -1,0 +1,174 @@
+"""What a process writes into a run's folder as the run goes on: logs, best policy, checkpoints, the result."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from saclab.environments.make import EnvironmentSpec
+from saclab.environments.vector import EndedEpisode
+from saclab.files import write_json
+from saclab.trained_policy import save_policy
+from saclab.training.checkpoint import save_checkpoint
+from saclab.training.evaluation import EvaluationEpisodes
+from saclab.training.events import EpisodeEnded, Evaluated, Event, Finished, Progress, Saved, UpdatesLogged, Warned
+from saclab.training.q_bias import QBias
+from saclab.training.run_folder import Logs, append_line
+from saclab.training.snapshot import EnvironmentStates, Snapshot, to_checkpoint
+from saclab.training.starts import Beginning
+
+SANE_TEMPERATURES = (1e-5, 100.0)
+
+
+class RunWriter:
+    """One session of one run, on whose folder the process has the lock."""
+
+    def __init__(self, beginning: Beginning, spec: EnvironmentSpec, folder: Path, facts: dict[str, Any]) -> None:
+        """Open the logs, cut back to the checkpoint, and enter this session.
+
+        Args:
+            beginning: the run, and where it goes on; the engine is built from the same one.
+            spec: of its environment.
+            folder: the run folder.
+            facts: what may decide the result's last bits, from `machine_facts`.
+
+        Raises:
+            UserError: if a log is shorter than the checkpoint remembers.
+        """
+        self.run, self.notes = beginning.start.run, beginning.notes
+        self.spec, self.folder, self.facts = spec, folder, facts
+        self.warned_of_temperature = False
+        self.resumed_at_step = self.run.counters.steps
+        self._write_best()
+        self.logs = Logs(folder, self.run.config.training.evaluation_episodes, beginning.log_lengths)
+        self._record_session()
+        self.seconds_before, self.started = self.run.counters.seconds, time.monotonic()
+
+    def close(self) -> None:
+        """Close the logs; what is still unwritten on a full disk belongs to steps after the last checkpoint."""
+        with suppress(OSError):
+            self.logs.close()
+
+    def _seconds(self) -> float:
+        """Wall-clock time of the run, earlier sessions counted in."""
+        return round(self.seconds_before + time.monotonic() - self.started, 3)
+
+    def progress(self) -> Progress:
+        counters = self.run.counters
+        return Progress(counters.steps, counters.updates, counters.episodes, self.run.fraction_done(), self._seconds())
+
+    def log_episode(self, episode: EndedEpisode) -> Iterator[Event]:
+        run, counters = self.run, self.run.counters
+        number = run.count_episode(episode)
+        average = counters.running_average if number else episode.total_reward
+        assert average is not None
+        self.logs.episode(
+            number, counters.steps, counters.updates, episode.total_reward, average, episode.length,
+            int(episode.terminated), self._seconds(),
+        )  # fmt: skip
+        if number:
+            yield EpisodeEnded(number, counters.steps, counters.updates, episode.total_reward, average, episode.length)
+
+    def log_updates(self) -> Iterator[Event]:
+        """One line for the window of updates, whose metrics have been delivered; a new window begins.
+
+        Raises:
+            NonFiniteError: if one of them is not finite.
+        """
+        counters = self.run.counters
+        values = self.run.close_window().mean(axis=0, dtype="float64")
+        means = dict(zip(self.run.metrics, values.tolist(), strict=True))
+        self.logs.metrics({"updates": counters.updates, "steps": counters.steps, **means, "seconds": self._seconds()})
+        yield UpdatesLogged(counters.steps, counters.updates, means)
+        yield from self._watch_temperature(means["temperature"])
+
+    def _watch_temperature(self, temperature: float) -> Iterator[Event]:
+        """Warn once of a learned temperature that explodes or collapses."""
+        low, high = SANE_TEMPERATURES
+        if self.warned_of_temperature or self.run.config.algorithm.temperature == "fixed" or low < temperature < high:
+            return
+        self.warned_of_temperature = True
+        advice = (
+            "the policy cannot reach the target entropy: lower --target-entropy"
+            if temperature >= high
+            else "the policy stays above the target entropy without any bonus: raise --target-entropy"
+        )
+        yield Warned(
+            f"the temperature is {temperature:.3g}, outside {low:g} to {high:g}: {advice}, or lower "
+            "--temperature-learning-rate, or scale the environment's rewards"
+        )
+
+    def log_evaluation(self, episodes: EvaluationEpisodes, best: bool, bias: QBias | None) -> Evaluated:
+        """Log an evaluation that the run has taken in already, with the critics' bias after it where it is measured."""
+        counters = self.run.counters
+        self.logs.evaluation(
+            counters.evaluations, counters.steps, counters.updates, counters.episodes, counters.last_return,
+            *episodes.total_rewards.tolist(), *episodes.lengths.tolist(), self._seconds(),
+        )  # fmt: skip
+        if bias is not None:
+            self.logs.q_bias(
+                counters.evaluations, counters.steps, counters.updates, counters.episodes, *bias, self._seconds()
+            )
+        if best:
+            self._write_best()
+        return Evaluated(
+            counters.evaluations, counters.steps, counters.updates, counters.episodes, episodes.total_rewards, best
+        )
+
+    def _write_best(self) -> None:
+        run = self.run
+        if run.best_actor is not None:
+            facts = {"mean_return": run.counters.best_return, "episode": run.counters.best_at_episode}
+            save_policy(self.folder / "best", run.config, self.spec, run.best_actor, facts)
+
+    def save(self, snapshot: Snapshot, environments: EnvironmentStates) -> Saved:
+        """Write a checkpoint.
+
+        Raises:
+            NonFiniteError: if the run is not worth continuing.
+        """
+        began, counters = time.monotonic(), self.run.counters
+        counters.seconds = self._seconds()
+        checkpoint = to_checkpoint(snapshot, environments)
+        checkpoint.state["logs"] = self.logs.positions()
+        checkpoint.state["facts"] = self.facts
+        path = save_checkpoint(
+            self.folder / "checkpoints", counters.steps, checkpoint, snapshot.replay, self.run.evaluation_postponed
+        )
+        return Saved(path, time.monotonic() - began)
+
+    def _record_session(self) -> None:
+        """One line per session in sessions.jsonl: where it began, on what, and what was noted."""
+        entry = {
+            "began": datetime.now(UTC).isoformat(timespec="seconds"),
+            "from_step": self.resumed_at_step,
+            "process": os.getpid(),
+            "notes": self.notes[1:],
+            **self.facts,
+        }
+        append_line(self.folder / "sessions.jsonl", entry)
+
+    def finish(self, reason: str) -> Iterator[Event]:
+        """Write the result of the run, whose last updates are logged, whose policy is evaluated, and which is saved."""
+        counters = self.run.counters
+        assert counters.best_return is not None
+        assert counters.last_return is not None
+        result = {
+            "reason": reason,
+            "steps": counters.steps,
+            "updates": counters.updates,
+            "episodes": counters.episodes,
+            "best_return": counters.best_return,
+            "final_return": counters.last_return,
+            "seconds": counters.seconds,
+        }
+        write_json(self.folder / "result.json", result)
+        yield self.progress()
+        yield Finished(
+            reason, counters.steps, counters.updates, counters.episodes, counters.best_return, counters.last_return
+        )

@@ -1,0 +1,111 @@
+"""A run at one moment: what an engine gives for a checkpoint, and what an engine is built from."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from saclab.algorithm.types import LearnerState
+from saclab.config import Config
+from saclab.replay import RowLayout
+from saclab.training.captured import join_arrays, part, plain_numbers, require_like, restore_generator, split_arrays
+from saclab.training.checkpoint import Arrays, Checkpoint, CheckpointError, Replay
+from saclab.training.learners import finite_arrays, initial_learner, learner_from
+from saclab.training.run_state import Counters, RunState
+
+EnvironmentStates = list[dict[str, Any] | None]
+"""What `TrainingEnvironments.capture` gives."""
+
+
+class Start(NamedTuple):
+    """A run but for its replay buffer, before an engine steps it: new, or as a checkpoint has it."""
+
+    run: RunState
+    learner: LearnerState
+    behaviour: np.ndarray | None = None
+    """f32[P]: the behaviour parameters, where they are a round of updates behind."""
+    environments: EnvironmentStates | None = None
+    """None for those of a new run, whose first episodes begin."""
+
+    @property
+    def restarting(self) -> list[int]:
+        """The environments that have to begin a new episode, as their state could not be captured."""
+        return [index for index, state in enumerate(self.environments or ()) if state is None]
+
+
+class Snapshot(NamedTuple):
+    """A run as its engine has it. It is good until the engine takes its next step."""
+
+    run: RunState
+    """The state itself, not a copy; its window has the metrics of every update that was made."""
+    learner: LearnerState
+    behaviour: np.ndarray
+    """f32[P]: the parameters that choose the actions: with acting_delay 1, those before the last round of updates."""
+    observation: np.ndarray
+    """f32[N, O]: what the environments show now."""
+    replay: Replay
+
+
+def new_start(config: Config, layout: RowLayout) -> Start:
+    """A run before its first step."""
+    return Start(RunState(config, layout.action_size), initial_learner(config, layout))
+
+
+def to_checkpoint(snapshot: Snapshot, environments: EnvironmentStates) -> Checkpoint:
+    """Everything but the transitions, which lie in `snapshot.replay`.
+
+    Raises:
+        NonFiniteError: if the run is not worth continuing.
+    """
+    run = snapshot.run
+    learner = finite_arrays(snapshot.learner, run.counters.updates)
+    environment_arrays, environment_states = split_arrays(environments)
+    groups: dict[str, Arrays] = {
+        "learner": learner,
+        "environments": environment_arrays,
+        "window": {"metrics": run.window_array()},
+    }
+    if run.best_actor is not None:
+        groups["best"] = {"actor": run.best_actor}
+    if run.config.training.acting_delay:
+        groups["acting"] = {"actor": snapshot.behaviour}
+    exploration, groups["exploration"] = run.exploration.capture()
+    groups["rewards"] = run.reward_scale.capture()
+    state = {
+        "counters": dataclasses.asdict(run.counters),
+        "environments": environment_states,
+        "exploration": exploration,
+        "sampling": run.sampling.bit_generator.state,
+    }
+    return Checkpoint({name: arrays for name, arrays in groups.items() if arrays}, state, snapshot.replay.added)
+
+
+def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -> Start:
+    """The run that `to_checkpoint` has taken apart.
+
+    Raises:
+        CheckpointError: if it is not one of a run with this configuration.
+    """
+    groups, state = checkpoint.groups, checkpoint.state
+    example = initial_learner(config, layout)
+    learner = learner_from(groups.get("learner", {}), example)
+    behaviour = None
+    if config.training.acting_delay:
+        behaviour = require_like("acting", groups.get("acting", {}).get("actor"), np.asarray(example.actor.weights))
+    run = RunState(config, layout.action_size)
+    window = groups.get("window", {}).get("metrics", np.zeros(0))
+    run.window = list(require_like("metrics", window, np.zeros((*window.shape[:1], len(run.metrics)), np.float32)))
+    if "best" in groups:
+        run.best_actor = require_like("best", groups["best"].get("actor"), np.asarray(example.actor.weights))
+    run.counters = Counters(**plain_numbers(state.get("counters"), dataclasses.asdict(Counters())))
+    run.logged_updates = run.counters.updates - len(run.window)
+    if run.counters.steps != checkpoint.transitions:
+        raise CheckpointError(f"the checkpoint has {run.counters.steps} steps and {checkpoint.transitions} transitions")
+    run.exploration.restore(state.get("exploration"), groups.get("exploration", {}))
+    run.reward_scale.restore(groups.get("rewards", {}))
+    restore_generator("sampling", run.sampling, state.get("sampling"))
+    like = np.zeros((config.training.parallel_environments, layout.observation_size), np.float32)
+    environments = join_arrays(groups.get("environments", {}), part(state, "environments", list), like)
+    return Start(run, learner, behaviour, environments)

@@ -54,6 +54,17 @@ def test_compare_trains_the_grid_and_writes_the_report(trained: Path) -> None:
     assert "Pendulum-v1" in page.read_text()
 
 
+def test_a_name_makes_an_arm_of_other_settings(trained: Path) -> None:
+    result = saclab(
+        "compare", "Pendulum-v1", "--variants", "averaged", "--name", "averaged-far", "--snapshot-interval", "20",
+        "--protocol", "quick", "--seeds", "1", *SHORT, "--runs", "named", folder=trained,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    report = saclab("report", "runs", "named", "--out", "arms", folder=trained)
+    assert report.returncode == 0, report.stderr
+    assert "| averaged-far | averaged | snapshot\\_interval 20 |" in (trained / "arms" / "report.md").read_text()
+
+
 def test_compare_again_skips_what_is_finished(trained: Path) -> None:
     before = (run_folder(trained) / "evaluations.csv").stat().st_mtime_ns
     result = saclab(

@@ -36,7 +36,7 @@ def write_run(
     returns: list[float] | None = None,
     q_bias: bool = False,
 ) -> Path:
-    """Write one run and return its folder; `returns` are the test returns, else a noisy rise to about `level`."""
+    """Write one run and return its folder; `returns` are the evaluation returns, else a noisy rise to about `level`."""
     config = make_config(environment, variant, protocol, seed, overrides=overrides)
     folder = run_path(root, config, name)
     folder.mkdir(parents=True)

@@ -44,6 +44,16 @@ def test_named_arms_are_compared_without_any_other_run(tmp_path):
     assert [arm.name for arm in read_comparison(runs).arms] == ["sac-lag", "averaged-spacing-200"]
 
 
+def test_what_all_runs_have_been_given_is_no_setting_of_an_arm(tmp_path):
+    small = {"batch_size": 16, "discount": 0.9}
+    runs = [write_run(tmp_path, variant, overrides=small) for variant in ("sac", "averaged")]
+    runs.append(write_run(tmp_path, "averaged", name="far", overrides=SPACED | small))
+    runs.append(write_run(tmp_path, "averaged", name="large", overrides=small | {"batch_size": 256}))
+    assert [arm.settings_text for arm in read_comparison(runs).arms] == [
+        "", "", "snapshot_interval 200", "batch_size 256",
+    ]  # fmt: skip
+
+
 def test_without_a_name_they_are_refused_with_the_way_out(tmp_path):
     runs = [write_run(tmp_path, "averaged", 0), write_run(tmp_path / "other", "averaged", 1, overrides=SPACED)]
     with pytest.raises(

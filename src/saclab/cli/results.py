@@ -82,7 +82,7 @@ class Report:
     out: Path = Path("report")
     """Folder to write to."""
     allow_mixed: bool = False
-    """Show runs that differ in more than variant and seed side by side, labelled by what differs, never pooled."""
+    """Show runs that differ in more than variant, name and seed as well, labelled by what differs, never pooled."""
 
     def __call__(self, console: Console) -> int:
         from saclab.report.report import write_report

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -163,10 +163,29 @@ def unlike_in_arm(run: RunRecord, first: RunRecord) -> dict[str, tuple[Any, Any]
     return {name: (here[name], there[name]) for name in names if here[name] != there[name]}
 
 
-def arm_of(run: RunRecord, first: RunRecord, differences: Mapping[str, tuple[Any, Any]]) -> Arm:
-    """The arm of a run, given the first run of its name or variant, and what makes it not comparable."""
-    name = own_name(run)
-    settings = beside_variant(first.config) if name is not None else {}
+def given_to_all(runs: Sequence[RunRecord]) -> dict[str, Any]:
+    """Settings beside the variant's own that all runs without a name of their own have been given."""
+    plain = [beside_variant(run.config) for run in runs if own_name(run) is None]
+    first, *others = plain or [{}]
+    return {name: value for name, value in first.items() if all(other.get(name) == value for other in others)}
+
+
+def arm_of(
+    run: RunRecord, first: RunRecord, differences: Mapping[str, tuple[Any, Any]], common: Mapping[str, Any]
+) -> Arm:
+    """The arm of a run.
+
+    Args:
+        run: of any name.
+        first: the first run of its name or variant.
+        differences: what makes it not comparable.
+        common: what `given_to_all` found; it is no setting of a single arm.
+    """
+    name, settings = own_name(run), {}
+    if name is not None and is_known(run.config):
+        here = asdict(first.config.algorithm)
+        names = beside_variant(first.config) | dict(common)
+        settings = {name: here[name] for name in names if name not in common or here[name] != common[name]}
     return Arm(
         run.config.variant,
         name,

@@ -15,7 +15,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from saclab.errors import UserError
-from saclab.report.arms import Arm, arm_of, beside_variant, conditions, is_known, own_name, unlike, unlike_in_arm
+from saclab.report.arms import (
+    Arm,
+    arm_of,
+    beside_variant,
+    conditions,
+    given_to_all,
+    is_known,
+    own_name,
+    unlike,
+    unlike_in_arm,
+)
 from saclab.report.text import shown
 from saclab.settings import AlgorithmSettings, field_names
 from saclab.training.run_folder import RunRecord, read_run
@@ -65,7 +75,7 @@ def group_runs(runs: Sequence[RunRecord], allow_mixed: bool = False) -> Comparis
     require_independent(runs)
     references = {name: reference_run([run for run in runs if run.config.environment == name])
                   for name in sorted({run.config.environment for run in runs})}  # fmt: skip
-    refusals = environment_differences(references)
+    refusals, common = environment_differences(references), given_to_all(runs)
     groups: dict[tuple[str, Arm], dict[int, RunRecord]] = {}
     firsts: dict[tuple[str | None, ...], RunRecord] = {}
     for run in runs:
@@ -73,7 +83,7 @@ def group_runs(runs: Sequence[RunRecord], allow_mixed: bool = False) -> Comparis
         first = firsts.setdefault(arm_key(run), run)
         inside = unlike_in_arm(run, first)
         differences = unlike(run, reference) | inside
-        arm = arm_of(run, first, differences)
+        arm = arm_of(run, first, differences, common)
         if differences and (environment, arm) not in groups:
             refusals.append(refusal(run, first if inside else reference, differences))
         same = groups.setdefault((environment, arm), {}).setdefault(run.config.seed, run)

@@ -16,7 +16,7 @@ from saclab.batch.replay import DeviceReplay
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import RunBroken
 from saclab.replay import draw
-from saclab.training.engine import NOTHING_HAPPENED, Broken, EnvironmentStateError, StepResult
+from saclab.training.engine import NOTHING_HAPPENED, Broken, StepResult
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.learners import numbers_of, reward_weights
 from saclab.training.q_bias import QBias
@@ -266,7 +266,7 @@ def restored_pool(starts: Sequence[Start], spec: EnvironmentSpec, workers: int) 
         for run, start in enumerate(starts):
             if start.environments is not None:
                 pool.restore(run, start.environments, start.run.restart_seeds())
-    except EnvironmentStateError:
+    except BaseException:
         pool.close()
         raise
     return pool

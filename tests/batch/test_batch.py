@@ -85,7 +85,9 @@ def test_the_behaviour_parameters_are_as_far_behind_as_they_are_alone():
 
 
 def test_transitions_and_draws_of_the_random_steps_are_those_of_the_run_alone():
-    configs = [config(seed=seed, parallel_environments=2) for seed in (3, 4, 5)]
+    changes = {"reward_scaling": "deviation", "reward_terms": ("reward_run",), "reward_weights": (2.0,)}
+    configs = [config(seed=seed, environment="HalfCheetah-v4", parallel_environments=2, **changes)
+               for seed in (3, 4, 5)]  # fmt: skip
     with closing(engine_of(configs, workers=2)) as group:
         for _ in range(30):
             group.step()
@@ -99,6 +101,8 @@ def test_transitions_and_draws_of_the_random_steps_are_those_of_the_run_alone():
                 np.testing.assert_array_equal(ours.replay.rows[: ours.replay.size], theirs.replay.rows[: group.steps])
                 np.testing.assert_array_equal(ours.observation, theirs.observation)
                 assert ours.run.exploration.capture()[0] == theirs.run.exploration.capture()[0]
+                assert ours.run.reward_scale.moments[0] > group.steps
+                assert ours.run.reward_scale.moments.tolist() == theirs.run.reward_scale.moments.tolist()
                 assert ours.run.sampling.bit_generator.state == theirs.run.sampling.bit_generator.state
 
 

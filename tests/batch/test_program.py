@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from axes import AXES
 
 from saclab.algorithm.scalars import scalars
 from saclab.algorithm.types import Context
@@ -17,6 +18,7 @@ from saclab.training.learners import compiled_init, compiled_update, named_leave
 
 from .helpers import config, mixed
 
+LEARNING = {name: changes for name, changes in AXES.items() if "reward" not in name}
 LAYOUT = RowLayout(3, 2)
 CAPACITY = 50
 
@@ -25,12 +27,12 @@ def stacked(trees):
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
 
 
-@pytest.mark.parametrize("snapshots", [1, 3])
-def test_each_slot_is_updated_by_its_own_numbers(snapshots):
+@pytest.mark.parametrize("changes", [{"snapshots": 1}, {"snapshots": 3}, *LEARNING.values()])
+def test_each_slot_is_updated_by_its_own_numbers(changes):
     """Fixed and learned α, γ, τ, learning rates and the snapshot interval differ; rows are stored, then drawn."""
-    settings = [each.algorithm for each in mixed(snapshots=snapshots, batch_size=16)]
-    settings.append(config(snapshots=snapshots, batch_size=16, snapshot_interval=4, temperature="fixed",
-                           initial_temperature=0.0).algorithm)  # fmt: skip
+    settings = [each.algorithm for each in mixed(batch_size=16, **changes)]
+    settings.append(config(batch_size=16, snapshot_interval=4, temperature="fixed", initial_temperature=0.0,
+                           **changes).algorithm)  # fmt: skip
     numbers, shape = [scalars(each, 2) for each in settings], structure(settings[0])
     init, update = compiled_init(shape, LAYOUT), compiled_update(shape, LAYOUT)
     states = [init(own, seeds.learner_key(run)) for run, own in enumerate(numbers)]
@@ -49,16 +51,17 @@ def test_each_slot_is_updated_by_its_own_numbers(snapshots):
         Context(np.int32(0), np.ones((len(settings), 1), np.float32), np.ones(len(settings), np.float32)),
     )  # fmt: skip
     np.testing.assert_array_equal(replay, rows)
+    tolerance = 5e-4 if "network" in changes else 2e-5  # batch normalisation makes more of a rounding
     for run, own in enumerate(numbers):
         expected = states[run]
         for turn in range(5):
             now = Context(np.int32(turn), np.ones(1, np.float32), np.float32(1))
             expected, values = update(own, expected, rows[run][drawn[run, turn]], now)
-            np.testing.assert_allclose(metrics[run, turn], values, rtol=2e-4, atol=2e-5)
+            np.testing.assert_allclose(metrics[run, turn], values, rtol=2e-4, atol=tolerance)
         found = named_leaves(jax.tree.map(lambda leaf, run=run: leaf[run], state))
         assert found.keys() == named_leaves(expected).keys()
         for name, value in named_leaves(expected).items():
-            np.testing.assert_allclose(found[name], value, rtol=1e-3, atol=2e-5, err_msg=f"{run}{name}")
+            np.testing.assert_allclose(found[name], value, rtol=1e-3, atol=tolerance, err_msg=f"{run}{name}")
 
 
 def test_actions_are_those_of_each_runs_policy():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 
 import pytest
+from axes import TOGETHER
 from resume.helpers import assert_same_run
 
 from saclab.batch.engine import DeviceEngine
@@ -17,7 +18,7 @@ from saclab.training.events import Evaluated, Interrupted, Saved, UpdatesLogged
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished, read_run
 
-from .helpers import at_step, folders, mixed, stop_at, train
+from .helpers import at_step, config, folders, mixed, stop_at, train
 
 
 @pytest.mark.parametrize("environment", ["Pendulum-v1", pytest.param("Hopper-v4", marks=pytest.mark.slow)])
@@ -34,6 +35,15 @@ def test_a_stopped_batch_goes_on_bit_for_bit(tmp_path, environment, stop):
         folders(tmp_path / "straight", configs), folders(tmp_path / "stopped", configs), strict=True
     ):
         assert_same_run(straight, stopped)
+
+
+def test_a_group_with_every_axis_at_once_goes_on_bit_for_bit(tmp_path):
+    configs = [config("averaged-auto", seed, "HalfCheetah-v4", **TOGETHER) for seed in (0, 1)]
+    train(tmp_path / "straight", configs)
+    stop_at(149, tmp_path / "stopped", configs)
+    train(tmp_path / "stopped", configs)
+    for run in ("run-0", "run-1"):
+        assert_same_run(tmp_path / "straight" / run, tmp_path / "stopped" / run)
 
 
 def test_a_group_that_goes_on_reads_each_file_of_its_checkpoints_once(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from axes import AXES, TOGETHER
 
 from saclab.training import checkpoint, loop, starts
 from saclab.training.checkpoint import newest_first, read_manifest
@@ -47,6 +48,16 @@ def assert_exact(config, folder: Path) -> None:
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 def test_every_variant_continues_exactly(environment, variant, environments, tmp_path):
     assert_exact(small_config(environment, variant, environments), tmp_path)
+
+
+def test_every_axis_at_once_continues_exactly(tmp_path):
+    assert_exact(small_config("HalfCheetah-v4", environments=3, critic_hidden_layers=(8,), **TOGETHER), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", AXES)
+def test_every_axis_continues_exactly(axis, tmp_path):
+    assert_exact(small_config("HalfCheetah-v4", environments=3, **AXES[axis]), tmp_path)
 
 
 @pytest.fixture(scope="module")

@@ -189,6 +189,13 @@ def test_another_replay_capacity_is_refused(tmp_path):
         load_newest_checkpoint(tmp_path, ReplayBuffer(60, LAYOUT), lambda warning: None)
 
 
+def test_other_columns_of_the_same_width_are_refused(tmp_path):
+    two_checkpoints(tmp_path)
+    assert LAYOUT.width == (other := RowLayout(1, 1, reward_terms=3)).width
+    with pytest.raises(CheckpointError, match=r"columns of its transitions are .*'reward_terms': 1.* not .*: 3"):
+        load_newest_checkpoint(tmp_path, ReplayBuffer(CAPACITY, other), lambda warning: None)
+
+
 @pytest.mark.parametrize("files_before", [0, 2, 5])
 def test_a_full_disk_is_told_and_leaves_what_was_there(tmp_path, monkeypatch, files_before):
     _, replay = two_checkpoints(tmp_path)

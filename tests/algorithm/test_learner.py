@@ -179,6 +179,16 @@ def test_a_fixed_temperature_of_zero_is_finite_and_leaves_the_entropy_out(case_o
     assert not np.asarray(states[-1].entropy_terms).any()
 
 
+def test_the_reward_is_the_weighted_sum_of_its_terms_over_the_scale(case_of):
+    case = case_of("sac/mlp")
+    state, batch = case.initial_state(), case.batch(np.random.default_rng(0))
+    terms = np.concatenate([batch.reward_terms, 2 * batch.reward_terms, np.ones_like(batch.reward_terms)], axis=1)
+    weighted = context(0)._replace(reward_weights=np.array([1.0, -0.25, 3.0], np.float32), reward_scale=np.float32(0.5))
+    ours = case.compiled(case.numbers, state, batch._replace(reward_terms=terms), weighted)
+    same = batch._replace(reward_terms=(batch.reward_terms * (1 - 0.5) + 3) / 0.5)
+    np.testing.assert_allclose(ours.report, case.update(state, same, 0).report, rtol=1e-5)
+
+
 def test_the_numpy_policy_of_a_trained_actor_acts_like_the_jax_one(variant):
     state = after(variant, 3)[0][-1]
     observation = np.random.default_rng(0).standard_normal((5, 3)).astype(np.float32)

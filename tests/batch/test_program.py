@@ -51,7 +51,8 @@ def test_each_slot_is_updated_by_its_own_numbers(changes):
         Context(np.int32(0), np.ones((len(settings), 1), np.float32), np.ones(len(settings), np.float32)),
     )  # fmt: skip
     np.testing.assert_array_equal(replay, rows)
-    tolerance = 5e-4 if "network" in changes else 2e-5  # batch normalisation makes more of a rounding
+    # Batch normalisation leaves gradients that are 0 but for rounding, and Adam makes whole steps of them.
+    tolerance = 2e-3 if "network" in changes else 2e-5
     for run, own in enumerate(numbers):
         expected = states[run]
         for turn in range(5):

@@ -191,7 +191,8 @@ def test_another_replay_capacity_is_refused(tmp_path):
 
 def test_other_columns_of_the_same_width_are_refused(tmp_path):
     two_checkpoints(tmp_path)
-    assert LAYOUT.width == (other := RowLayout(1, 1, reward_terms=3)).width
+    other = RowLayout(1, 1, reward_terms=3)
+    assert other.width == LAYOUT.width
     with pytest.raises(CheckpointError, match=r"columns of its transitions are .*'reward_terms': 1.* not .*: 3"):
         load_newest_checkpoint(tmp_path, ReplayBuffer(CAPACITY, other), lambda warning: None)
 

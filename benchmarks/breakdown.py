@@ -171,7 +171,7 @@ def main() -> None:
     prepare_process()
     what = f"{options.environment}, {options.variant}"
     loop = loop_breakdown(options.environment, options.variant, options.updates)
-    show(f"{what}: per update, with its 5 environment steps and their share of the evaluations", loop)
+    show(f"{what}: per update, with its 5 environment steps and their share of the tests", loop)
     update = update_breakdown(options.environment, options.variant, options.updates)
     show(f"{what}: one update", update)
     keep(f"breakdown-{options.environment}-{options.variant}", loop_milliseconds=loop, update_milliseconds=update)

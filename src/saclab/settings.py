@@ -208,7 +208,7 @@ def require_possible(settings: AlgorithmSettings) -> None:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a run goes: how much experience, how many updates, when it is evaluated and when it stops."""
+    """How a run goes: how much experience, how many updates, when it is tested, when it stops."""
 
     parallel_environments: int = 1
     """Training environments stepped in turn. The update-to-data ratio does not depend on it: steps are counted
@@ -232,16 +232,16 @@ class TrainingSettings:
     max_episodes: int | None = None
     """Stop after so many training episodes."""
     patience_episodes: int | None = None
-    """Stop after so many training episodes without a better evaluation return."""
+    """Stop after so many training episodes without a better test return."""
 
     evaluation_interval_episodes: int | None = None
-    """Evaluate the policy after so many training episodes."""
+    """Test the policy after so many training episodes."""
     evaluation_interval_steps: int | None = None
-    """Evaluate the policy after so many environment steps."""
+    """Test the policy after so many environment steps."""
     evaluation_episodes: int = 10
-    """Episodes of one evaluation, with the deterministic policy (tanh of the mean), stepped side by side."""
+    """Episodes of one test, with the deterministic policy (tanh of the mean), stepped side by side."""
     q_bias_episodes: int = 0
-    """Episodes of the stochastic policy after each evaluation, which tell the critics' bias; 0 for none."""
+    """Episodes of the stochastic policy after each test, from which the critics' bias is estimated; 0 for none."""
     log_interval: int = 200
     """Updates that are averaged into one line of metrics.jsonl."""
 

@@ -83,3 +83,10 @@ def test_a_trained_run_gives_a_policy_that_plays_as_its_evaluation_said(tmp_path
     played = evaluate_policy(policy, gymnasium.make("Pendulum-v1"), 2)
     evaluator = Evaluator("Pendulum-v1", {})
     np.testing.assert_allclose(evaluator.run(policy.normalised_action, [0, 1]).total_rewards, played, rtol=1e-4)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="there is no folder .*elsewhere"):
+        load_policy(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="holds no policy yet"):
+        load_policy(tmp_path)

@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from saclab.errors import SettingError, unknown_name
 
@@ -144,6 +144,9 @@ class AlgorithmSettings:
 
 def require_ranges(settings: AlgorithmSettings) -> None:
     """Raise SettingError for a value that cannot work whatever the others are."""
+    for name, known in choices().items():
+        value = getattr(settings, name)
+        require(value in known, name, value, f"use one of {', '.join(map(str, known))}")
 
     def check(name: str, condition: Callable[[Any], bool], way_out: str) -> None:
         require(condition(getattr(settings, name)), name, getattr(settings, name), way_out)
@@ -301,6 +304,17 @@ def algorithm_from_json(values: Mapping[str, Any]) -> AlgorithmSettings:
         AlgorithmSettings(),
         {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()},
     )
+
+
+@lru_cache(maxsize=1)
+def choices() -> dict[str, tuple[str | None, ...]]:
+    """The values that a setting may have, for each setting of AlgorithmSettings that is a choice between names."""
+    found: dict[str, tuple[str | None, ...]] = {}
+    for name, hint in get_type_hints(AlgorithmSettings).items():
+        for kind in (hint, *get_args(hint)):
+            if get_origin(kind) is Literal:
+                found[name] = get_args(kind) if kind is hint else (*get_args(kind), None)
+    return found
 
 
 @lru_cache(maxsize=1)

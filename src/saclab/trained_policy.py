@@ -106,6 +106,8 @@ def load_policy(run: Path | str) -> TrainedPolicy:
         UserError: if there is none, or its files are damaged.
     """
     folder = policy_folder(Path(run))
+    if not folder.is_dir():
+        raise UserError(f"there is no folder {run}: give that of a run, or its best policy's")
     if not (folder / ARRAYS).is_file():
         raise UserError(f"{run} holds no policy yet: the first is kept after the run's first evaluation")
     description = read_description(folder)

@@ -86,7 +86,7 @@ def test_a_trained_run_gives_a_policy_that_plays_as_its_evaluation_said(tmp_path
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="there is no folder .*elsewhere"):
+    with pytest.raises(UserError, match=r"there is no folder .*elsewhere"):
         load_policy(tmp_path / "elsewhere")
     with pytest.raises(UserError, match="holds no policy yet"):
         load_policy(tmp_path)

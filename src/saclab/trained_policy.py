@@ -17,6 +17,7 @@ from saclab.errors import UserError
 from saclab.files import replace_file, write_json
 from saclab.settings import AlgorithmSettings, algorithm_from_json
 
+ACTION_TYPES = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 ARRAYS, DESCRIPTION = "policy.safetensors", "policy.json"
 
 
@@ -130,10 +131,10 @@ def require_arrays(policy: TrainedPolicy) -> None:
     """Raise ValueError unless the arrays are those of the policy's sizes."""
     spec = policy.spec
     expected = {
-        "actor": (policy.parameters, (policy.policy.network.size,)),
-        "action_low": (spec.action_low, (spec.action_size,)),
-        "action_high": (spec.action_high, (spec.action_size,)),
+        "actor": (policy.parameters, (policy.policy.network.size,), "f4"),
+        "action_low": (spec.action_low, (spec.action_size,), ACTION_TYPES),
+        "action_high": (spec.action_high, (spec.action_size,), spec.action_low.dtype.str[1:]),
     }
-    for name, (array, shape) in expected.items():
-        if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
-            raise ValueError(f"{name} is not f32{list(shape)} of finite numbers")
+    for name, (array, shape, kinds) in expected.items():
+        if array.shape != shape or array.dtype.str[1:] not in kinds or not np.isfinite(array).all():
+            raise ValueError(f"{name} is not {list(shape)} finite numbers of type {kinds}")

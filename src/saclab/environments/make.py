@@ -25,14 +25,16 @@ class EnvironmentSpec:
     observation_size: int
     action_size: int
     action_low: np.ndarray
-    """f32[A]: the environment's own bounds; inside saclab actions lie in [-1, 1]."""
+    """[A], of the action space's own type: its bounds; inside saclab actions lie in [-1, 1]."""
     action_high: np.ndarray
-    """f32[A]."""
+    """[A]."""
 
     def scale_action(self, action: np.ndarray) -> np.ndarray:
         """Actions [..., A] in [-1, 1] to the environment's bounds, clipped against rounding."""
         middle, half_range = self._middle_and_half_range
         scaled: np.ndarray = np.minimum(np.maximum(middle + half_range * action, self.action_low), self.action_high)
+        if self.action_low.dtype.kind != "f":
+            scaled = np.rint(scaled)
         return scaled.astype(self.action_low.dtype, copy=False)
 
     @cached_property

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from saclab.environments.checked import checked_reset, checked_step
 from saclab.environments.make import environment_spec, make_environment
 from saclab.environments.reward_terms import split_reward
 from saclab.environments.simulator import capture_state, restore_state
@@ -76,17 +77,17 @@ class TrainingEnvironments:
         ended = []
         scaled = self.spec.scale_action(action)
         for index, environment in enumerate(self.environments):
-            seen, gained, terminated[index], truncated, info = environment.step(scaled[index])
-            next_observation[index] = seen
-            self._require_finite(index, next_observation[index], float(np.float32(gained)), scaled[index])
-            reward_terms[index] = split_reward(self.name, gained, info, self.reward_terms)
-            self.total_rewards[index] += float(gained)
+            step = checked_step(environment, scaled[index], self.spec.observation_size)
+            next_observation[index], terminated[index] = step.observation, step.terminated
+            self._require_finite(index, next_observation[index], float(np.float32(step.reward)), scaled[index])
+            reward_terms[index] = split_reward(self.name, step.reward, step.info, self.reward_terms)
+            self.total_rewards[index] += step.reward
             self.lengths[index] += 1
-            if terminated[index] or truncated:
-                ended.append(self._ended(index, bool(terminated[index])))
+            if step.terminated or step.truncated:
+                ended.append(self._ended(index, step.terminated))
                 self._start_episode(index)
             else:
-                self.observation[index] = seen
+                self.observation[index] = step.observation
         return Transitions(observation, action, reward_terms, next_observation, terminated), ended
 
     def close(self) -> None:
@@ -126,7 +127,8 @@ class TrainingEnvironments:
         return EndedEpisode(index, float(self.total_rewards[index]), int(self.lengths[index]), terminated)
 
     def _start_episode(self, index: int, seed: int | None = None) -> None:
-        self.observation[index], _ = self.environments[index].reset(seed=seed)
+        size = self.spec.observation_size
+        self.observation[index] = checked_reset(self.environments[index], size, seed)
         self.total_rewards[index], self.lengths[index] = 0.0, 0
         self._require_finite(index, self.observation[index], 0.0, np.zeros(0, np.float32))
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from saclab.environments.checked import checked_reset, checked_step
 from saclab.environments.make import environment_spec, make_environment
 from saclab.errors import NonFiniteError
 
@@ -36,17 +37,18 @@ class Evaluator:
             self.environments.append(make_environment(self.name, self.arguments))
         observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
         for index, seed in enumerate(seeds):
-            observation[index], _ = self.environments[index].reset(seed=seed)
+            observation[index] = checked_reset(self.environments[index], self.spec.observation_size, seed)
         total_rewards, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
         active = list(range(len(seeds)))
         while active:
             actions = self.spec.scale_action(act(observation[active]))
             going_on = []
             for index, action in zip(active, actions, strict=True):
-                observation[index], reward, terminated, truncated, _ = self.environments[index].step(action)
-                total_rewards[index] += float(reward)
+                step = checked_step(self.environments[index], action, self.spec.observation_size)
+                observation[index] = step.observation
+                total_rewards[index] += step.reward
                 lengths[index] += 1
-                if not (terminated or truncated):
+                if not (step.terminated or step.truncated):
                     going_on.append(index)
             active = going_on
             self._require_finite(observation, total_rewards)

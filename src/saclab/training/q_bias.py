@@ -18,6 +18,7 @@ from saclab.algorithm.learner import Learner
 from saclab.algorithm.networks.network import Array
 from saclab.algorithm.policy import Policy
 from saclab.config import Config
+from saclab.environments.checked import checked_reset, checked_step
 from saclab.environments.make import EnvironmentSpec
 from saclab.training import seeds
 
@@ -119,19 +120,20 @@ def play(
     critics: Critics, environment: Any, spec: EnvironmentSpec, seed: int, generator: np.random.Generator
 ) -> Episode:
     """One episode of the stochastic policy."""
-    observation, _ = environment.reset(seed=seed)
+    observation = checked_reset(environment, spec.observation_size, seed)
     rows: list[tuple[np.ndarray, np.ndarray, float, float]] = []
     act: Callable[..., tuple[np.ndarray, np.ndarray]] = critics.policy.sample
     while True:
         seen = np.asarray(observation, np.float32)[None]
         noise = generator.standard_normal((1, spec.action_size), np.float32)
         action, log_prob = act(critics.actor, seen, noise)
-        observation, reward, terminated, truncated, _ = environment.step(spec.scale_action(action)[0])
-        rows.append((seen[0], action[0], float(reward), float(log_prob[0])))
-        if terminated or truncated:
+        step = checked_step(environment, spec.scale_action(action)[0], spec.observation_size)
+        observation = step.observation
+        rows.append((seen[0], action[0], step.reward, float(log_prob[0])))
+        if step.terminated or step.truncated:
             break
     observations, actions, rewards, log_probs = (np.array(column) for column in zip(*rows, strict=True))
-    return Episode(observations, actions, rewards, log_probs, bool(terminated))
+    return Episode(observations, actions, rewards, log_probs, step.terminated)
 
 
 def known_returns(episode: Episode, alpha: float, discount: float) -> np.ndarray:

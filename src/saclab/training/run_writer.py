@@ -13,7 +13,7 @@ from typing import Any
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
 from saclab.files import write_json
-from saclab.trained_policy import save_policy
+from saclab.trained_policy import load_policy, save_policy
 from saclab.training.checkpoint import save_checkpoint
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.events import EpisodeEnded, Evaluated, Event, Finished, Progress, Saved, UpdatesLogged, Warned
@@ -42,7 +42,7 @@ class RunWriter:
         """
         self.run, self.notes = beginning.start.run, beginning.notes
         self.spec, self.folder, self.facts = spec, folder, facts
-        self.warned_of_temperature = False
+        self.warned_of_temperature = self.policy_was_read = False
         self.resumed_at_step = self.run.counters.steps
         self._write_best()
         self.logs = Logs(folder, self.run.config.training.evaluation_episodes, beginning.log_lengths)
@@ -125,6 +125,9 @@ class RunWriter:
         if run.best_actor is not None:
             facts = {"mean_return": run.counters.best_return, "episode": run.counters.best_at_episode}
             save_policy(self.folder / "best", run.config, self.spec, run.best_actor, facts)
+            if not self.policy_was_read:
+                load_policy(self.folder / "best")  # what could not be read at the end must not be trained for hours
+                self.policy_was_read = True
 
     def save(self, snapshot: Snapshot, environments: EnvironmentStates) -> Saved:
         """Write a checkpoint.

@@ -31,7 +31,7 @@ from .helpers import at_step, config, engine_of, failures, folders, mixed, tiny_
     ("environment", "environments"),
     [("Pendulum-v1", 1), ("Fragile-v0", 3), pytest.param("Pendulum-v1", 3, marks=pytest.mark.slow)],
 )
-def test_a_run_of_a_batch_is_the_run_alone(tmp_path, monkeypatch, environment, environments):
+def test_a_run_of_a_group_is_the_run_alone(tmp_path, monkeypatch, environment, environments):
     """Equal but for rounding, as long as Pendulum does not make a difference of it; episodes end in the other one."""
     with tiny_environments(monkeypatch) as prefix:
         name = prefix + environment if environment == "Fragile-v0" else environment
@@ -84,7 +84,8 @@ def test_the_behaviour_parameters_are_as_far_behind_as_they_are_alone():
         np.testing.assert_allclose(found, actions, atol=0.01)
 
 
-def test_transitions_and_draws_of_the_random_steps_are_those_of_the_run_alone():
+def test_the_random_steps_are_those_of_the_run_alone():
+    """Transitions, observations and the generators, to the last bit."""
     configs = [config(seed=seed, parallel_environments=2) for seed in (3, 4, 5)]
     with closing(engine_of(configs, workers=2)) as group:
         for _ in range(30):
@@ -203,7 +204,8 @@ def test_a_run_whose_update_breaks_is_told_of_the_update(tmp_path):
     assert is_finished(tmp_path / "run-0")
 
 
-def test_a_process_that_dies_is_reported_with_its_last_words_and_nothing_is_lost(tmp_path, monkeypatch):
+def test_a_process_that_dies_has_its_last_words_told(tmp_path, monkeypatch):
+    """Nothing is lost: all runs have a checkpoint of the same step."""
     with tiny_environments(monkeypatch) as prefix:
         configs = [make(config(seed=seed, environment=prefix + "Fragile-v0"), "exit") for seed in range(4)]
         with pytest.raises(EnvironmentWorkerDied, match=r"exit status 1: the process came off\. Nothing .* is lost"):
@@ -259,7 +261,7 @@ def test_replay_buffers_that_do_not_fit_are_refused(tmp_path):
         ({"environment": "MountainCarContinuous-v0"}, "environment"),
     ],
 )
-def test_runs_of_different_structure_are_refused_before_anything_is_written(tmp_path, changes, named):
+def test_runs_of_different_structure_are_refused_and_nothing_is_written(tmp_path, changes, named):
     """Otherwise the first one's setting would be used for all of them, in silence."""
     with pytest.raises(UserError, match=rf"must agree in {named}"):
         train(tmp_path, [config(seed=0), config(seed=1, discount=0.5), config(seed=2, **changes)])

@@ -20,7 +20,7 @@ def arguments(**overrides: object) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_comparison_in_batches_that_is_killed_again_and_again_ends_the_same(tmp_path):
+def test_a_comparison_in_groups_that_is_killed_often_ends_the_same(tmp_path):
     (tmp_path / "straight").mkdir()
     (tmp_path / "killed").mkdir()
     run(tmp_path / "straight", *arguments())

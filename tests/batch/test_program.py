@@ -96,7 +96,7 @@ def test_the_inputs_of_a_step_are_taken_apart_bit_for_bit():
         assert found.tobytes() == part[0].tobytes(), name
 
 
-def test_runs_that_differ_in_plain_numbers_start_from_one_compiled_function():
+def test_runs_that_differ_in_plain_numbers_share_what_is_compiled():
     first, second = (each.algorithm for each in mixed()[1:])
     assert first != second
     assert structure(first) == structure(second)

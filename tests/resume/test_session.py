@@ -37,7 +37,8 @@ with locked(Path(sys.argv[1])):
 """
 
 
-def test_a_second_process_is_refused_with_the_firsts_id_and_a_dead_ones_lock_is_taken_over(tmp_path):
+def test_a_second_process_is_refused_with_the_id_of_the_first(tmp_path):
+    """The lock of a dead one is taken over."""
     first = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     try:
         assert first.stdout is not None
@@ -146,7 +147,8 @@ def test_a_checkpoint_of_format_1_is_still_read_and_continues(tmp_path):
 # --- environments that cannot be captured
 
 
-def test_an_environment_that_cannot_be_captured_starts_a_new_episode_which_is_told_and_recorded(tmp_path):
+def test_an_environment_that_cannot_be_captured_starts_a_new_episode(tmp_path):
+    """That is told and recorded."""
     config = small_config("Counting-v0", environments=2, hidden_layers=(8,))
     stop_at(123 + 1, config, tmp_path)
     events = finish(config, tmp_path)

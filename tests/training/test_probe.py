@@ -36,9 +36,8 @@ SETTINGS = {
     ],
     ids=["terminated", "truncated"],
 )
-def test_a_constant_reward_is_worth_itself_before_a_terminal_state_and_all_its_future_before_a_time_limit(
-    terminal, worth
-):
+def test_a_constant_reward_is_worth_what_follows_it(terminal, worth):
+    """Nothing follows a terminal state; the future goes on beyond a time limit."""
     assert tiny.TIME_LIMIT == 5
     config = make_config("Constant-v0", "sac", environment_arguments={"terminal": terminal}, overrides=SETTINGS)
     ends = []

@@ -158,14 +158,17 @@ def test_a_run_that_breaks_leaves_the_others_untouched(tmp_path, monkeypatch, ho
 
 
 def test_an_environment_that_breaks_in_an_evaluation_ends_its_own_run(tmp_path, monkeypatch):
-    """Which it would do again each time the group is continued."""
+    """It would do so again each time the group is continued."""
     with tiny_environments(monkeypatch) as prefix:
-        told = train(tmp_path, [
-            make(config(seed=seed, environment=prefix + "Fragile-v0", evaluation_episodes=1), "raise", broken_at=15)
-            for seed in range(4)
-        ])  # fmt: skip
-    assert 0 < len(failures(told)) <= 4
+        configs = [config(seed=seed, environment=prefix + "Fragile-v0", evaluation_episodes=1) for seed in range(8)]
+        sound = [own for run, own in enumerate(configs) if run not in doomed_of(configs)]  # while they are trained
+        told = train(tmp_path, [make(own, "raise", broken_at=15) for own in sound])
+    assert 0 < len(failures(told)) < len(sound)
     assert all("wheels came off" in message for message in failures(told).values())
+    for run in range(len(sound)):
+        evaluations = read_run(tmp_path / f"run-{run}").evaluations["evaluation"]
+        assert (len(evaluations) == 3) == (run not in failures(told)), "a failed run lacks the one that broke it"
+        assert is_finished(tmp_path / f"run-{run}") == (run not in failures(told))
 
 
 def spoil_critic(engine, run):

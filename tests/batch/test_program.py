@@ -97,6 +97,8 @@ def test_the_inputs_of_a_step_are_taken_apart_bit_for_bit():
 
 
 def test_runs_that_differ_in_plain_numbers_share_what_is_compiled():
-    first, second = (each.algorithm for each in mixed()[1:])
+    first, second, other = (each.algorithm for each in (*mixed()[1:], config(snapshots=2)))
     assert first != second
-    assert structure(first) == structure(second)
+    for compiled in (compiled_init, compiled_update):
+        assert compiled(structure(first), LAYOUT) is compiled(structure(second), LAYOUT)
+        assert compiled(structure(first), LAYOUT) is not compiled(structure(other), LAYOUT)

@@ -200,10 +200,12 @@ def test_any_other_value_in_the_configuration_is_read_or_refused(folder):
             path.write_text(json.dumps(changed))
             try:
                 read = read_config(folder).to_dict()
-                assert new in ((), ({},)) or read == changed["config"], place  # what is missing has its default
                 outcomes["read"] += 1
             except UserError:
                 outcomes["refused"] += 1
+                continue
+            if new not in ((), ({},)):  # what is missing has its default
+                assert read == changed["config"], place
     assert min(outcomes.values()) > 50, outcomes
 
 
@@ -218,7 +220,7 @@ def test_a_damaged_description_is_named(stage, folder, name, content):
 
 
 @pytest.mark.parametrize("content", HOSTILE)
-def test_a_policy_made_to_harm_is_refused(stage, folder, tmp_path, content):
+def test_a_policy_made_to_harm_is_refused(folder, tmp_path, content):
     harm = tmp_path / "harmed"
     (folder / "best" / "policy.safetensors").write_bytes(HOSTILE[content](Harm(harm)))
     with pytest.raises(UserError, match="is damaged"):

@@ -1,4 +1,4 @@
-"""Test episodes stepped side by side are the episodes that each would be alone."""
+"""Evaluation episodes stepped side by side are the episodes that each would be alone."""
 
 from __future__ import annotations
 

@@ -247,7 +247,7 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
         (("train", "Pendulum-v1", "--protocol", "papper"), "did you mean 'paper'"),
         (("train", "Pendulum-v1", "--snapshot", "3"), "--snapshots"),
         (("train", "CartPole-v1"), "actions are discrete"),
-        (("train", "Pendulum-v1", "--snapshots", "0"), "snapshots = 0"),
+        (("train", "Pendulum-v1", "--snapshots", "-1"), "snapshots = -1"),
         (("train", "Pendulum-v1", "--random-steps", "100"), "--batch-size 100 or less"),
         (("train", "Pendulum-v1", "--replay-capacity", "900000000000"), "GiB"),
         (("train", "Pendulum-v1", "--environment-arguments", "{wrong"), "not JSON"),

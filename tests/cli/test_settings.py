@@ -42,7 +42,7 @@ def test_help_shows_what_the_named_variant_and_protocol_have(capsys):
             parse([*words, "--protocol", "quick", "--help"])
         told = " ".join(capsys.readouterr().out.replace("│", " ").split())
         assert "Transitions per update. (default: 64)" in told
-        assert "1 is plain SAC. (default: 10)" in told
+        assert "the critics themselves value the next state. (default: 10)" in told
         assert f"or its first value if it is learned. (default: {0.1 if words[0] == 'train' else 0.2})" in told
     with pytest.raises(UserError, match="did you mean 'averaged'"):
         named_config(["train", "--variant", "averagd"])

@@ -101,7 +101,7 @@ def test_another_machine_is_told_with_the_setting_to_use(stage, folder, name, be
 
 
 def test_a_checkpoint_without_facts_is_read(stage, folder):
-    """As one from before a fact was recorded."""
+    """It comes from before a fact was recorded."""
     manifest = json.loads((newest(folder) / "manifest.json").read_text())
     del manifest["state"]["facts"]["machine"]["numpy_threads"]
     sign(newest(folder), manifest)
@@ -224,7 +224,7 @@ def test_wrappers_without_a_state_are_no_hindrance(wrapper):
     assert capture_state(environment) is not None
 
     class Subclass(wrapper):
-        """Which might keep something."""
+        """It might keep something."""
 
     other = Subclass(make_environment("Pendulum-v1"))
     other.reset(seed=0)

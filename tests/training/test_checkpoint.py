@@ -45,7 +45,7 @@ def save(folder, step: int, replay: ReplayBuffer):
 
 
 def load(folder) -> tuple[Checkpoint | None, ReplayBuffer, list[str]]:
-    """Into a fresh buffer full of other numbers; with the warnings."""
+    """The newest checkpoint, a fresh buffer, full of other numbers before, and the warnings."""
     replay, warnings = ReplayBuffer(CAPACITY, LAYOUT), []
     replay.rows[:] = 999
     return load_newest_checkpoint(folder, replay, warnings.append), replay, warnings

@@ -56,8 +56,6 @@ class ArmScores(NamedTuple):
     """Interquartile means with 95 % intervals, here and below."""
     best: Interval
     area: Interval
-    final_mean: Interval
-    final_median: Interval
     steps_to_threshold: Interval
     """Median over runs."""
     reached: int
@@ -172,8 +170,6 @@ def score_arm(environment: str, arm: Arm, runs: Sequence[RunScore], thresholds: 
         final=bootstrap_interval([final]),
         best=bootstrap_interval([values("best")]),
         area=bootstrap_interval([values("area")]),
-        final_mean=bootstrap_interval([final], mean),
-        final_median=bootstrap_interval([final], median),
         steps_to_threshold=bootstrap_interval([to_threshold], median),
         reached=int(np.sum(np.isfinite(to_threshold))),
         paper_best=TABLE_2.get(environment, {}).get(arm.paper_name or ""),

@@ -70,7 +70,8 @@ class Trained:
         inputs = np.array([state, action], np.float32)
         return [float(self.learner.q_values(critic, inputs)) for critic in np.asarray(self.state.critic.weights)]
 
-    def actions(self, state: float, count: int = 20_000) -> np.ndarray:
+    def actions(self, state: float) -> np.ndarray:
+        count = 20_000
         noise = np.random.default_rng(0).standard_normal((count, 1)).astype(np.float32)
         observation = np.full((count, 1), state, np.float32)
         return self.learner.policy.act(np.asarray(self.state.actor.weights), observation, noise)[:, 0]

@@ -18,7 +18,6 @@ from saclab.report.statistics import (
     area_under_curve,
     bootstrap_interval,
     interquartile_mean,
-    mean,
     median,
     normalise,
     performance_profile,
@@ -92,8 +91,6 @@ class AggregateArm(NamedTuple):
 
     arm: Arm
     interquartile_mean: Interval
-    mean: Interval
-    median: Interval
     profile: Band
 
 
@@ -194,7 +191,6 @@ def aggregate(environments: Sequence[EnvironmentScores]) -> AggregateScores | No
     for arm in shared:
         strata = [normalise(entry[arm].values("final"), scores.thresholds[0], scores.thresholds[-1])
                   for entry, scores in zip(complete, environments)]  # fmt: skip
-        iqm, average, middle = (bootstrap_interval(strata, each) for each in (interquartile_mean, mean, median))
-        arms.append(AggregateArm(arm, iqm, average, middle, performance_profile(strata, thresholds)))
+        arms.append(AggregateArm(arm, bootstrap_interval(strata), performance_profile(strata, thresholds)))
     pairs = compare_pairs([{arm: entry[arm].by_seed for arm in shared} for entry in complete])
     return AggregateScores(tuple(arms), pairs, thresholds)

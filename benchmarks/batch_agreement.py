@@ -1,8 +1,8 @@
-"""Do runs of a group learn as runs alone do? Compare the evaluation returns of two folders of runs, seed by seed drawn.
+"""Do the runs of a group learn as runs alone do? Compare the evaluation returns of two folders of runs.
 
     saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --acting-delay 1 --runs alone
-    saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --acting-delay 1 --batch 8 --runs batch
-    python benchmarks/batch_agreement.py alone batch --figure docs/images/batch-curves.png
+    saclab compare HalfCheetah-v4 --variants sac-auto --seeds 8 --protocol quick --acting-delay 1 --batch 8 --runs group
+    python benchmarks/batch_agreement.py alone group --figure docs/images/batch-curves.png
 
 Prints, for the mean over all evaluations and for the last one, the means over seeds with their standard errors, the
 difference with a 95 % interval (Welch) and the probability that a run of the first folder is above one of the second.

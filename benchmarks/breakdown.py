@@ -120,20 +120,23 @@ def update_breakdown(environment: str, variant: str, updates: int) -> dict[str, 
     products = matrix_products(run.config.algorithm, engine.replay.layout)
     operands = [[jnp.ones(shape) for shape in product.shapes] for product in products]
 
+    def given() -> tuple[Any, ...]:
+        """What an update takes; it gives the state's memory away, so the state is never the same one."""
+        return engine.numbers, engine.learner_state, rows, engine.context
+
     def update() -> None:
-        engine.learner_state, metrics = engine.update(engine.numbers, engine.learner_state, rows, engine.context)
+        engine.learner_state, metrics = engine.update(*given())
         metrics.block_until_ready()
 
     @jax.jit
     def all_products(operands: list[list[jax.Array]]) -> list[jax.Array]:
         return [product.multiply(*pair) for product, pair in zip(products, operands, strict=True)]
 
-    given = (engine.numbers, engine.learner_state, rows, engine.context)
     nothing = jax.jit(lambda numbers, state, rows, context: (state, rows[0]))
     timed = {
         "whole": update,
         "matrix products": lambda: jax.block_until_ready(all_products(operands)),
-        "calling XLA": lambda: jax.block_until_ready(nothing(*given)),
+        "calling XLA": lambda: jax.block_until_ready(nothing(*given())),
     }
     milliseconds = alternating(timed, updates)
     engine.close()
@@ -171,7 +174,7 @@ def main() -> None:
     prepare_process()
     what = f"{options.environment}, {options.variant}"
     loop = loop_breakdown(options.environment, options.variant, options.updates)
-    show(f"{what}: per update, with its 5 environment steps and their share of the tests", loop)
+    show(f"{what}: per update, with its 5 environment steps and their share of the evaluations", loop)
     update = update_breakdown(options.environment, options.variant, options.updates)
     show(f"{what}: one update", update)
     keep(f"breakdown-{options.environment}-{options.variant}", loop_milliseconds=loop, update_milliseconds=update)

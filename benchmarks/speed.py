@@ -53,8 +53,8 @@ class Case:
 
 # Two evaluation steps per training step, as under `paper` with episodes of 1000 steps; windows of whole evaluations.
 CASES = [
-    Case(environment, interval, grid, timed_updates, test_interval, episodes)
-    for interval, grid, timed_updates, test_interval, episodes in (
+    Case(environment, interval, grid, timed_updates, evaluation_interval, episodes)
+    for interval, grid, timed_updates, evaluation_interval, episodes in (
         (5, False, 400, 2000, 4), (1, False, 500, 500, 1), (5, True, 400, 2000, 4),
     )
     for environment in ("HalfCheetah-v4", "Humanoid-v4")
@@ -102,13 +102,13 @@ def race(case: Case, peers: Path) -> dict[str, dict[str, Any]]:
     return {"limit": limit(case, processes, results["saclab"]["test_steps_per_step"]), **results}
 
 
-def limit(case: Case, processes: list[dict[str, Any]], test_steps_per_step: float) -> dict[str, Any]:
+def limit(case: Case, processes: list[dict[str, Any]], evaluation_steps_per_step: float) -> dict[str, Any]:
     """Updates per second if nothing took time but the matrix products and the simulator."""
     rates = {}
     for variant in ("sac", "averaged"):
         seconds = [
             facts["update_operations"][variant] / facts["operations_per_second"]
-            + case.update_interval * (1 + test_steps_per_step) * facts["raw_step_seconds"]
+            + case.update_interval * (1 + evaluation_steps_per_step) * facts["raw_step_seconds"]
             for facts in processes
         ]
         rates[variant] = sum(1 / each for each in seconds)

@@ -73,7 +73,7 @@ def batches_tables() -> str:
             f"{record['date'][:10]}; Python {versions['python']}, jax {versions['jax']}. In brackets: the share of a "
             "step in which the host waits for actions.",
             "",
-            "| variant | runs of the batch | program alone, updates/s | batch, steps/s | one run alone, steps/s "
+            "| variant | runs of the group | program alone, updates/s | run group, steps/s | one run alone, steps/s "
             "| one run per core, steps/s | peak so far, MiB |",
             "|---|---|---|---|---|---|---|",
             *(batches_row(row) for row in record["rows"]),

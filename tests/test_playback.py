@@ -21,5 +21,5 @@ def test_the_camera_follows_the_robot(name: str) -> None:
 
 def test_an_environment_that_knows_no_camera_keeps_its_own_view() -> None:
     environment = filmed_environment("Pendulum-v1", {"g": 9.0}, size=64)
-    assert environment.unwrapped.g == 9.0
+    assert (environment.unwrapped.g, environment.unwrapped.render_mode) == (9.0, "rgb_array")
     environment.close()

@@ -1,4 +1,4 @@
-"""The rooms of the house: imports go down only, never in a circle; no file and no function is long."""
+"""The rooms of the house: imports go down only, never in a circle; no file, no function and no test's name is long."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOMS = (
     "replay", "trained_policy", "training", "signals", "batch", "grid", "report", "playback", "api", "cli",
 )  # fmt: skip
 """From the ground up: a room imports itself and what stands before it."""
-FILE_LINES, FUNCTION_LINES = 350, 55
+FILE_LINES, FUNCTION_LINES, NAME_LETTERS = 350, 55, 70
 FILES = {path.relative_to(HOUSE.parent).with_suffix("").as_posix().replace("/", "."): path
          for path in sorted(HOUSE.rglob("*.py")) if path.name not in ("__init__.py", "__main__.py")}  # fmt: skip
 
@@ -67,3 +67,12 @@ def test_no_file_and_no_function_is_long(module):
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef):
             assert node.end_lineno - node.lineno < FUNCTION_LINES, node.name
+
+
+def test_names_of_tests_are_short():
+    """A name says what holds; the rest of the sentence is the docstring's."""
+    trees = [ast.parse(path.read_text()) for path in Path(__file__).parent.rglob("test_*.py")]
+    names = [node.name for tree in trees for node in ast.walk(tree)
+             if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]  # fmt: skip
+    assert len(names) > 300
+    assert [name for name in names if len(name) > NAME_LETTERS] == []

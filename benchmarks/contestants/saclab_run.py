@@ -1,4 +1,4 @@
-"""saclab through the generator that its own commands use: logs, tests and best policy are written as always."""
+"""saclab through the generator that its own commands use: logs, evaluations and best policy are written as always."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ def main() -> None:
             case UpdatesLogged(updates=updates):
                 stopwatch.updates_made(updates)
     stopwatch.report(
-        "saclab", "jax", test_steps_per_step=test_steps(folder, job) / job.timed_updates / job.update_interval
+        "saclab", "jax", test_steps_per_step=evaluation_steps(folder, job) / job.timed_updates / job.update_interval
     )
 
 
-def test_steps(folder: Path, job: Job) -> float:
-    """Environment steps of the tests that fell into the window."""
-    tests = read_run(folder).evaluations
-    inside = (tests["updates"] >= job.warm_updates) & (tests["updates"] < job.warm_updates + job.timed_updates)
-    return float(tests["lengths"][inside].sum())
+def evaluation_steps(folder: Path, job: Job) -> float:
+    """Environment steps of the evaluations that fell into the window."""
+    evaluations = read_run(folder).evaluations
+    since = evaluations["updates"] - job.warm_updates
+    return float(evaluations["lengths"][(since >= 0) & (since < job.timed_updates)].sum())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Stable-Baselines3, and SBX, which has the same interface: `learn` with its own EvalCallback, tests side by side."""
+"""Stable-Baselines3, and SBX, which has the same interface: `learn`, its own EvalCallback, evaluations side by side."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def main(library: str) -> None:
         learning_starts=job.random_steps, train_freq=job.update_interval, gradient_steps=1, gamma=0.99, tau=0.005,
         ent_coef=0.2, policy_kwargs={"net_arch": [256, 256]}, seed=0,
     )  # fmt: skip
-    test = EvalCallback(
+    evaluation = EvalCallback(
         make_vec_env(job.environment, n_envs=job.evaluation_episodes), n_eval_episodes=job.evaluation_episodes,
         eval_freq=job.evaluation_interval_steps, best_model_save_path=job.folder, log_path=job.folder, verbose=0,
     )  # fmt: skip
-    model.learn(job.steps + job.update_interval, callback=CallbackList([Watch(stopwatch), test]))
+    model.learn(job.steps + job.update_interval, callback=CallbackList([Watch(stopwatch), evaluation]))
     stopwatch.report(library, "torch" if library == "stable-baselines3" else "jax")
 
 

@@ -13,7 +13,7 @@ from importlib.metadata import version
 
 @dataclass(frozen=True)
 class Job:
-    """One training: plain SAC with the paper's networks and Table 1, tests on the way."""
+    """One training: plain SAC with the paper's networks and Table 1, evaluations on the way."""
 
     environment: str
     update_interval: int
@@ -24,7 +24,7 @@ class Job:
     evaluation_interval_steps: int
     evaluation_episodes: int
     folder: str
-    """For what the contestant writes."""
+    """The contestant may write here."""
     began: float
     """`time.time()` when the process was started."""
     random_steps: int = 1_000

@@ -1,4 +1,4 @@
-"""Tianshou by its own off-policy trainer: an epoch lasts from test to test, tests side by side, best policy saved."""
+"""Tianshou by its own off-policy trainer: an epoch ends with an evaluation, side by side; the best policy is saved."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def main() -> None:
     stopwatch = Stopwatch(job)
     algorithm = make_algorithm(job)
     training = Collector[CollectStats](algorithm, gymnasium.make(job.environment), ReplayBuffer(job.replay_capacity))
-    tests = DummyVectorEnv([lambda: gymnasium.make(job.environment) for _ in range(job.evaluation_episodes)])
-    test_buffer = VectorReplayBuffer(2 * job.evaluation_episodes, job.evaluation_episodes)
+    evaluated = DummyVectorEnv([lambda: gymnasium.make(job.environment) for _ in range(job.evaluation_episodes)])
+    evaluation_buffer = VectorReplayBuffer(2 * job.evaluation_episodes, job.evaluation_episodes)
     training.reset()
     training.collect(n_step=job.random_steps, random=True)
 
@@ -43,7 +43,7 @@ def main() -> None:
     algorithm.run_training(
         OffPolicyTrainerParams(
             training_collector=training,
-            test_collector=Collector[CollectStats](algorithm, tests, test_buffer),
+            test_collector=Collector[CollectStats](algorithm, evaluated, evaluation_buffer),
             max_epochs=-(-job.steps // job.evaluation_interval_steps),
             epoch_num_steps=job.evaluation_interval_steps,
             collection_step_num_env_steps=job.update_interval,

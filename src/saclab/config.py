@@ -113,12 +113,12 @@ def common_settings(config: Config) -> dict[str, Any]:
 
 
 def require_same_structure(configs: Sequence[Config]) -> None:
-    """Refuse runs that cannot be one group: raises UserError with the first setting that differs."""
+    """Refuse runs that cannot be one run group: raises UserError with the first setting that differs."""
     expected = common_settings(configs[0])
     for place, config in enumerate(configs[1:], start=1):
         for name, value in common_settings(config).items():
             if value != expected[name]:
                 raise UserError(
-                    f"the runs of one group must agree in {name}, and it is {expected[name]!r} in the first and "
-                    f"{value!r} in number {place + 1}: train them in groups of their own, or each alone (--batch 0)"
+                    f"the runs of a run group must agree in {name}, and it is {expected[name]!r} in the first and "
+                    f"{value!r} in number {place + 1}: train them in run groups of their own, or each alone (--batch 0)"
                 )

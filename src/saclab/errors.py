@@ -27,7 +27,7 @@ class TrainingFailed(RuntimeError):  # noqa: N818 - it names what happened
 
 
 class RunBroken(TrainingFailed):
-    """Something in a run itself, its environment or an update, ends it; in a batch the other runs go on."""
+    """Something in a run itself, its environment or an update, ends it; the others of its run group go on."""
 
     def __init__(self, message: str, arrays: Mapping[str, Any] | None = None, traceback: str = "") -> None:
         super().__init__(message)

@@ -16,7 +16,7 @@ HOW_TO_MATCH = {
     "threads": "continue exactly with --threads {0} (or NPROC={0} in the environment)",
     "numpy_threads": "continue exactly with OPENBLAS_NUM_THREADS={0} in the environment (--threads sets it too)",
     "xla_flags": "continue exactly with XLA_FLAGS={0!r} in the environment",
-    "batch": "continue exactly in a batch of {0} (0: alone; see --batch)",
+    "batch": "continue exactly in a run group of {0} (0: alone; see --batch)",
 }
 
 
@@ -25,7 +25,7 @@ def machine_facts(device: str = "", batch: int = 0) -> dict[str, Any]:
 
     Args:
         device: what XLA computes on; empty where nothing is computed.
-        batch: slots of the batch that a run is trained in; 0 if it is alone.
+        batch: slots of the run group that a run is trained in; 0 if it is alone.
     """
     return {
         "versions": {package: version(package) for package in PACKAGES} | {"python": platform.python_version()},

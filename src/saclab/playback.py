@@ -17,7 +17,7 @@ from saclab.trained_policy import TrainedPolicy, load_policy, read_description
 from saclab.training.evaluation import Evaluator
 
 
-class TestResult(NamedTuple):
+class EvaluationResult(NamedTuple):
     """What `evaluate` found."""
 
     environment: str
@@ -37,7 +37,7 @@ class TestResult(NamedTuple):
 
 def evaluate(
     run: Path, episodes: int, seed: int, deterministic: bool = True, imports: Sequence[str] = ()
-) -> TestResult:
+) -> EvaluationResult:
     """Evaluate a run's best policy.
 
     Raises:
@@ -49,7 +49,7 @@ def evaluate(
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
     result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
     evaluator.close()
-    return TestResult(
+    return EvaluationResult(
         description["environment"], episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
         result.total_rewards.tolist(), result.lengths.tolist(),
     )  # fmt: skip

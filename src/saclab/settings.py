@@ -26,7 +26,7 @@ def require(condition: bool, setting: str, value: object, way_out: str) -> None:
 PLAIN_NUMBER = "plain number"
 Real = Annotated[float, PLAIN_NUMBER]
 """A setting that is an argument of the compiled update: another value needs no compilation, and runs that differ in
-such settings only can be trained as one group."""
+such settings only can be trained as one run group."""
 Whole = Annotated[int, PLAIN_NUMBER]
 
 Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
@@ -208,7 +208,7 @@ def require_possible(settings: AlgorithmSettings) -> None:
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a run goes: how much experience, how many updates, when it is tested, when it stops."""
+    """How a run goes: how much experience, how many updates, when it is evaluated, when it stops."""
 
     parallel_environments: int = 1
     """Training environments stepped in turn. The update-to-data ratio does not depend on it: steps are counted
@@ -232,16 +232,16 @@ class TrainingSettings:
     max_episodes: int | None = None
     """Stop after so many training episodes."""
     patience_episodes: int | None = None
-    """Stop after so many training episodes without a better test return."""
+    """Stop after so many training episodes without a better evaluation return."""
 
     evaluation_interval_episodes: int | None = None
-    """Test the policy after so many training episodes."""
+    """Evaluate the policy after so many training episodes."""
     evaluation_interval_steps: int | None = None
-    """Test the policy after so many environment steps."""
+    """Evaluate the policy after so many environment steps."""
     evaluation_episodes: int = 10
-    """Episodes of one test, with the deterministic policy (tanh of the mean), stepped side by side."""
+    """Episodes of one evaluation, with the deterministic policy (tanh of the mean), stepped side by side."""
     q_bias_episodes: int = 0
-    """Episodes of the stochastic policy after each test, from which the critics' bias is estimated; 0 for none."""
+    """Episodes of the stochastic policy after each evaluation, to estimate the critics' bias from; 0 for none."""
     log_interval: int = 200
     """Updates that are averaged into one line of metrics.jsonl."""
 

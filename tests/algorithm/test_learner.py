@@ -150,14 +150,14 @@ def test_averaging_over_one_snapshot_or_minibatch_is_sac_by_its_settings(case_of
     assert case_of("averaged-entropy/mlp", entropy_window=1).settings == plain
 
 
-def test_averaging_over_one_snapshot_is_sac_bit_for_bit_whatever_the_interval(case_of):
+def test_averaging_over_one_snapshot_is_sac_bit_for_bit(case_of):
     """The ring of one takes the same path through the code as ten do."""
     plain, _ = after(case_of("sac/mlp"), 6)
     averaged, _ = after(case_of("averaged/mlp", snapshots=1, snapshot_interval=4), 6)
     assert_equal(plain[-1], averaged[-1])
 
 
-def test_averaging_over_snapshots_differs_from_sac_as_soon_as_the_snapshots_do(case_of):
+def test_averaging_differs_from_sac_as_soon_as_the_snapshots_differ(case_of):
     plain, plain_metrics = after(case_of("sac/mlp"), 3)
     averaged, averaged_metrics = after(case_of("averaged/mlp"), 3)
     assert (

@@ -43,7 +43,8 @@ def test_inputs_that_belong_side_by_side_may_come_apart():
     np.testing.assert_allclose(jax.grad(total, 1)(x[:, :2], x[:, 2:]), jax.grad(total)(x)[:, 2:], rtol=1e-5)
 
 
-def test_weights_and_biases_start_uniform_within_one_over_the_root_of_the_inputs():
+def test_weights_start_uniform_within_one_over_the_root_of_the_inputs():
+    """So do the biases."""
     network = NETWORKS["mlp"](100, (400,), 1, "relu", "none")
     first = np.asarray(network.init(jax.random.PRNGKey(0)))[: 101 * 400]
     assert np.abs(first).max() == pytest.approx(0.1, rel=1e-3)
@@ -54,9 +55,9 @@ def test_weights_and_biases_start_uniform_within_one_over_the_root_of_the_inputs
 KEY = jax.random.PRNGKey(0)
 
 
-def random_vector(network, seed: int = 0) -> np.ndarray:
+def random_vector(network) -> np.ndarray:
     """Parameters and statistics away from their start; the variances stay above zero."""
-    vector = np.random.default_rng(seed).normal(0, 0.5, network.size).astype(np.float32)
+    vector = np.random.default_rng(0).normal(0, 0.5, network.size).astype(np.float32)
     return np.where(np.arange(network.size) >= network.size - network.statistics, np.abs(vector) + 0.5, vector)
 
 
@@ -135,7 +136,7 @@ def straight_line(vector: np.ndarray, x: np.ndarray) -> np.ndarray:
     return x @ second.reshape(4, 2) + last_bias
 
 
-def test_batch_normalisation_and_its_gradient_equal_a_straight_line_reference():
+def test_batch_normalisation_and_its_gradient_equal_the_reference():
     network = batch_norm_mlp(3, (4,), 2, "relu")
     vector, x = random_vector(network).astype(np.float64), batch().astype(np.float64)
     weight = np.random.default_rng(2).standard_normal((6, 2))

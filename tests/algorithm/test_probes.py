@@ -70,7 +70,8 @@ class Trained:
         inputs = np.array([state, action], np.float32)
         return [float(self.learner.q_values(critic, inputs)) for critic in np.asarray(self.state.critic.weights)]
 
-    def actions(self, state: float, count: int = 20_000) -> np.ndarray:
+    def actions(self, state: float) -> np.ndarray:
+        count = 20_000
         noise = np.random.default_rng(0).standard_normal((count, 1)).astype(np.float32)
         observation = np.full((count, 1), state, np.float32)
         return self.learner.policy.act(np.asarray(self.state.actor.weights), observation, noise)[:, 0]
@@ -91,7 +92,8 @@ def test_a_one_step_episode_is_worth_its_reward_without_any_entropy():
     ],
     ids=["sac", "averaged", "categorical", "batch norm without target"],
 )
-def test_an_episode_that_only_time_ends_is_worth_all_its_future_rewards_and_entropies(changes):
+def test_an_episode_that_only_time_ends_is_worth_all_its_future(changes):
+    """Rewards and entropies."""
     batches = stream(reward=2.0, state=1.0, next_state=1.0, terminated=0, action=uniform_actions())
     trained = Trained(batches, **changes)
     assert trained.metrics["entropy"] == pytest.approx(UNIFORM_ENTROPY, abs=0.02)
@@ -99,7 +101,8 @@ def test_an_episode_that_only_time_ends_is_worth_all_its_future_rewards_and_entr
     assert trained.q(1.0) == pytest.approx([worth, worth], abs=0.08)
 
 
-def test_along_a_chain_the_last_state_has_its_reward_and_the_one_before_the_discounted_soft_value():
+def test_values_go_back_along_a_chain():
+    """The last state has its reward, the one before it the discounted soft value."""
     first = np.arange(BATCH) % 2 == 0
     batches = stream(
         reward=np.where(first, -1.0, 3.0),
@@ -114,7 +117,7 @@ def test_along_a_chain_the_last_state_has_its_reward_and_the_one_before_the_disc
     assert trained.q(-1.0) == pytest.approx([before, before], abs=0.08)
 
 
-def test_the_policy_prefers_the_rewarded_actions_as_much_as_the_temperature_lets_it():
+def test_the_policy_prefers_rewarded_actions_as_the_temperature_allows():
     actions = uniform_actions()
     trained = Trained(stream(reward=2 * actions, state=1.0, next_state=1.0, terminated=1, action=actions))
     # The best policy is proportional to exp(2a / α) on [-1, 1]: mean coth(2/α) - α/2
@@ -122,7 +125,7 @@ def test_the_policy_prefers_the_rewarded_actions_as_much_as_the_temperature_lets
     assert trained.q(1.0, 0.5) == pytest.approx([1.0, 1.0], abs=0.1)
 
 
-def test_the_learned_temperature_settles_where_the_policy_has_the_target_entropy():
+def test_the_learned_temperature_brings_the_target_entropy():
     actions = uniform_actions()
     batches = stream(reward=-3 * actions**2, state=1.0, next_state=1.0, terminated=1, action=actions)
     trained = Trained(batches, temperature="learned", target_entropy=0.0)

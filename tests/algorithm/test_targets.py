@@ -49,7 +49,7 @@ def test_with_one_snapshot_it_is_the_smaller_q():
     assert spread == 0
 
 
-def test_the_minimum_takes_the_whole_prediction_of_the_critic_with_the_smaller_q():
+def test_the_minimum_is_the_prediction_of_the_critic_with_the_smaller_q():
     predictions = jnp.array([[[0.0, 1.0], [0.5, 0.5]], [[0.75, 0.25], [0.0, 1.0]]])  # [C, B, n], values 0 and 1
     q = predictions @ jnp.array([0.0, 1.0])
     assert REDUCTIONS["minimum"](predictions, q).tolist() == [[0.75, 0.25], [0.5, 0.5]]

@@ -20,11 +20,11 @@ def loss_and_slope(log_alpha: float, entropy: float, target: float, factor: str)
     return float(loss), float(slope)
 
 
-def test_on_log_alpha_the_loss_is_log_alpha_times_the_entropy_above_the_target():
+def test_the_loss_on_log_alpha_is_log_alpha_times_the_entropy_excess():
     assert loss_and_slope(math.log(0.5), 2.0, -2.0, "log_alpha") == pytest.approx((math.log(0.5) * 4, 4), rel=1e-6)
 
 
-def test_on_alpha_the_loss_is_alpha_times_the_entropy_above_the_target():
+def test_the_loss_on_alpha_is_alpha_times_the_entropy_excess():
     assert loss_and_slope(math.log(0.5), 2.0, -2.0, "alpha") == pytest.approx((0.5 * 4, 0.5 * 4), rel=1e-6)
 
 
@@ -36,7 +36,7 @@ def test_alpha_falls_above_the_target_entropy_and_rises_below_it(gradient, above
     assert moved == pytest.approx(direction * 0.01, rel=1e-3)  # Adam's first step is the learning rate
 
 
-def test_the_target_entropy_is_minus_the_number_of_actions_unless_it_is_given():
+def test_the_target_entropy_is_minus_the_number_of_actions_by_default():
     state, report = after_one_update()  # α = 1: log α = 0, and so is the loss
     assert report["temperature_loss"] == 0
     assert state.temperature.moments.mu / 0.1 == pytest.approx(report["entropy"] + 2, rel=1e-5)  # two actions

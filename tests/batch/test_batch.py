@@ -31,7 +31,7 @@ from .helpers import at_step, config, engine_of, failures, folders, mixed, tiny_
     ("environment", "environments"),
     [("Pendulum-v1", 1), ("Fragile-v0", 3), pytest.param("Pendulum-v1", 3, marks=pytest.mark.slow)],
 )
-def test_a_run_of_a_batch_is_the_run_alone(tmp_path, monkeypatch, environment, environments):
+def test_a_run_of_a_group_is_the_run_alone(tmp_path, monkeypatch, environment, environments):
     """Equal but for rounding, as long as Pendulum does not make a difference of it; episodes end in the other one."""
     with tiny_environments(monkeypatch) as prefix:
         name = prefix + environment if environment == "Fragile-v0" else environment
@@ -84,7 +84,8 @@ def test_the_behaviour_parameters_are_as_far_behind_as_they_are_alone():
         np.testing.assert_allclose(found, actions, atol=0.01)
 
 
-def test_transitions_and_draws_of_the_random_steps_are_those_of_the_run_alone():
+def test_the_random_steps_are_those_of_the_run_alone():
+    """Transitions, observations, generators and the scale of rewards, to the last bit."""
     changes = {"reward_scaling": "deviation", "reward_terms": ("reward_run",), "reward_weights": (2.0,)}
     configs = [config(seed=seed, environment="HalfCheetah-v4", parallel_environments=2, **changes)
                for seed in (3, 4, 5)]  # fmt: skip
@@ -161,14 +162,17 @@ def test_a_run_that_breaks_leaves_the_others_untouched(tmp_path, monkeypatch, ho
 
 
 def test_an_environment_that_breaks_in_an_evaluation_ends_its_own_run(tmp_path, monkeypatch):
-    """Which it would do again each time the group is continued."""
+    """It would do so again each time the group is continued."""
     with tiny_environments(monkeypatch) as prefix:
-        told = train(tmp_path, [
-            make(config(seed=seed, environment=prefix + "Fragile-v0", evaluation_episodes=1), "raise", broken_at=15)
-            for seed in range(4)
-        ])  # fmt: skip
-    assert 0 < len(failures(told)) <= 4
+        configs = [config(seed=seed, environment=prefix + "Fragile-v0", evaluation_episodes=1) for seed in range(8)]
+        sound = [own for run, own in enumerate(configs) if run not in doomed_of(configs)]  # while they are trained
+        told = train(tmp_path, [make(own, "raise", broken_at=15) for own in sound])
+    assert 0 < len(failures(told)) < len(sound)
     assert all("wheels came off" in message for message in failures(told).values())
+    for run in range(len(sound)):
+        evaluations = read_run(tmp_path / f"run-{run}").evaluations["evaluation"]
+        assert (len(evaluations) == 3) == (run not in failures(told)), "a failed run lacks the one that broke it"
+        assert is_finished(tmp_path / f"run-{run}") == (run not in failures(told))
 
 
 def spoil_critic(engine, run):
@@ -207,7 +211,8 @@ def test_a_run_whose_update_breaks_is_told_of_the_update(tmp_path):
     assert is_finished(tmp_path / "run-0")
 
 
-def test_a_process_that_dies_is_reported_with_its_last_words_and_nothing_is_lost(tmp_path, monkeypatch):
+def test_a_process_that_dies_has_its_last_words_told(tmp_path, monkeypatch):
+    """Nothing is lost: all runs have a checkpoint of the same step."""
     with tiny_environments(monkeypatch) as prefix:
         configs = [make(config(seed=seed, environment=prefix + "Fragile-v0"), "exit") for seed in range(4)]
         with pytest.raises(EnvironmentWorkerDied, match=r"exit status 1: the process came off\. Nothing .* is lost"):
@@ -263,7 +268,7 @@ def test_replay_buffers_that_do_not_fit_are_refused(tmp_path):
         ({"environment": "MountainCarContinuous-v0"}, "environment"),
     ],
 )
-def test_runs_of_different_structure_are_refused_before_anything_is_written(tmp_path, changes, named):
+def test_runs_of_different_structure_are_refused_and_nothing_is_written(tmp_path, changes, named):
     """Otherwise the first one's setting would be used for all of them, in silence."""
     with pytest.raises(UserError, match=rf"must agree in {named}"):
         train(tmp_path, [config(seed=0), config(seed=1, discount=0.5), config(seed=2, **changes)])

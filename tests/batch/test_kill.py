@@ -1,4 +1,4 @@
-"""`kill -9` on a whole comparison in batches, at moments that nobody chose: the same command goes on bit for bit."""
+"""`kill -9` on a whole comparison in run groups, at moments that nobody chose: the same command goes on bit for bit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def arguments(**overrides: object) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_comparison_in_batches_that_is_killed_again_and_again_ends_the_same(tmp_path):
+def test_a_comparison_in_groups_that_is_killed_often_ends_the_same(tmp_path):
     (tmp_path / "straight").mkdir()
     (tmp_path / "killed").mkdir()
     run(tmp_path / "straight", *arguments())
@@ -31,7 +31,7 @@ def test_a_comparison_in_batches_that_is_killed_again_and_again_ends_the_same(tm
             (tmp_path / "killed").rglob("checkpoints/step-*")))  # fmt: skip
         time.sleep(chance.uniform(0, 8))
         kill(process)
-        end_of_batch_processes(tmp_path)
+        end_of_processes(tmp_path)
     run(tmp_path / "killed", *arguments())
     folders = sorted(path.parent for path in (tmp_path / "straight").rglob("result.json"))
     assert len(folders) == 4
@@ -39,7 +39,7 @@ def test_a_comparison_in_batches_that_is_killed_again_and_again_ends_the_same(tm
         assert_same_run(folder, tmp_path / "killed" / folder.relative_to(tmp_path / "straight"))
 
 
-def end_of_batch_processes(root):
+def end_of_processes(root):
     """The launcher is gone; its worker notices when it next speaks, and saves. Its lock says whether it is there."""
     import fcntl
 

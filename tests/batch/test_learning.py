@@ -1,4 +1,4 @@
-"""Runs of a batch learn as runs alone do: real learning, judged over seeds, so marked slow."""
+"""Runs of a run group learn as runs alone do: real learning, judged over seeds, so marked slow."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SETTINGS = {
 def test_curves_on_pendulum_agree(tmp_path):
     """The area under the learning curve of each seed: a difference of means well within its standard error."""
     areas = {}
-    for name, batch in (("alone", 0), ("batch", SEEDS)):
+    for name, batch in (("alone", 0), ("group", SEEDS)):
         result = saclab.compare(
             ["Pendulum-v1"], ["sac-auto"], SEEDS, "quick", batch=batch, runs=tmp_path / name, **SETTINGS
         )
@@ -28,7 +28,7 @@ def test_curves_on_pendulum_agree(tmp_path):
         areas[name] = curves.mean(axis=1)
         assert np.median(curves[:, -1]) > -500, "most of the task is learned"
         assert curves[:, :3].mean() < -400, "and was not at the start"
-    difference = areas["alone"].mean() - areas["batch"].mean()
+    difference = areas["alone"].mean() - areas["group"].mean()
     standard_error = np.sqrt(sum(area.var(ddof=1) / SEEDS for area in areas.values()))
     assert abs(difference) < 3 * standard_error
-    assert len({*areas["alone"], *areas["batch"]}) == 2 * SEEDS, "they are not the same runs to the bit"
+    assert len({*areas["alone"], *areas["group"]}) == 2 * SEEDS, "they are not the same runs to the bit"

@@ -13,7 +13,7 @@ from saclab.batch.loop import train_batch
 from saclab.batch.pool import EnvironmentWorkerDied
 from saclab.training import checkpoint, loop
 from saclab.training.checkpoint import CheckpointError
-from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
+from saclab.training.common_checkpoint import checkpoint_steps, group_slots
 from saclab.training.events import Evaluated, Interrupted, Saved, UpdatesLogged
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished, read_run
@@ -23,8 +23,8 @@ from .helpers import at_step, config, folders, mixed, stop_at, train
 
 @pytest.mark.parametrize("environment", ["Pendulum-v1", pytest.param("Hopper-v4", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("stop", [50, 149])
-def test_a_stopped_batch_goes_on_bit_for_bit(tmp_path, environment, stop):
-    """In the random steps and after, with a window of metrics, a round of updates and an episode under way."""
+def test_a_stopped_group_goes_on_bit_for_bit(tmp_path, environment, stop):
+    """The stop comes in the random steps or after, a window of metrics, a round of updates and an episode under way."""
     configs = mixed(environment=environment, snapshots=2)
     train(tmp_path / "straight", configs)
     told = stop_at(stop, tmp_path / "stopped", configs)
@@ -111,23 +111,23 @@ def test_a_crash_while_saving_goes_back_to_the_step_that_all_have(tmp_path):
         assert_same_run(tmp_path / f"straight/run-{index}", tmp_path / f"killed/run-{index}")
 
 
-def test_runs_that_are_not_equally_far_are_no_batch(tmp_path):
+def test_runs_that_are_not_equally_far_are_no_group(tmp_path):
     configs = mixed()
     stop_at(50, tmp_path, configs[:1])
     with pytest.raises(CheckpointError, match=r"no whole checkpoint of the same step: .*run-0 has step-000000000050"):
         train(tmp_path, configs)
 
 
-def test_a_run_of_a_batch_can_go_on_alone_and_says_that_bits_may_differ(tmp_path):
+def test_a_run_of_a_group_goes_on_alone_and_says_that_bits_may_differ(tmp_path):
     configs = mixed()
     stop_at(150, tmp_path, configs)
-    assert batch_slots(tmp_path / "run-0") == 3
+    assert group_slots(tmp_path / "run-0") == 3
     told = list(loop.train(configs[0], tmp_path / "run-0"))
     assert any("batch was 3 when the checkpoint was made and is 0 now" in note for note in told[0].notes)
     assert read_run(tmp_path / "run-0").result["steps"] == 240
 
 
-def test_a_batch_whose_process_is_killed_goes_on_bit_for_bit(tmp_path):
+def test_a_group_whose_process_is_killed_goes_on_bit_for_bit(tmp_path):
     configs = mixed()
     train(tmp_path / "straight", configs)
     with (

@@ -60,13 +60,13 @@ def write_page(runs, out):
         return write_report(runs, out)
 
 
-def write_video(path, size=64, frames=12):
+def write_video(path):
     """A second of grey that gets brighter, in the codec of `saclab record`."""
     path.parent.mkdir()
-    writer = imageio_ffmpeg.write_frames(str(path), (size, size), fps=12)
+    writer = imageio_ffmpeg.write_frames(str(path), (64, 64), fps=12)
     writer.send(None)
-    for frame in range(frames):
-        writer.send(np.full((size, size, 3), 20 * frame, np.uint8))
+    for frame in range(12):
+        writer.send(np.full((64, 64, 3), 20 * frame, np.uint8))
     writer.close()
 
 

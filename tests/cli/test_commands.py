@@ -22,10 +22,10 @@ SMALL = ("--random-steps", "200", "--batch-size", "32", "--hidden-layers", "16",
 SHORT = (*SMALL, "--max-updates", "300", "--evaluation-interval-steps", "250", "--log-interval", "50")
 
 
-def saclab(*arguments: str, folder: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+def saclab(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Run a command in `folder`, one core, and no terminal."""
     return subprocess.run(
-        [sys.executable, "-m", "saclab", *arguments], cwd=folder, capture_output=True, text=True, timeout=timeout
+        [sys.executable, "-m", "saclab", *arguments], cwd=folder, capture_output=True, text=True, timeout=120
     )
 
 

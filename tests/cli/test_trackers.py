@@ -41,7 +41,7 @@ def test_tensorboard_files_hold_the_runs_numbers(tmp_path: Path) -> None:
         pass
     run, scalars = read_run(tmp_path), list(read_scalars(tmp_path / "tensorboard"))
     for tag, steps, values in (
-        ("test/mean_return", run.evaluations["steps"], run.evaluations["mean_return"]),
+        ("evaluation/mean_return", run.evaluations["steps"], run.evaluations["mean_return"]),
         ("training/return", run.episodes["steps"], run.episodes["return"]),
         ("losses/critic_loss", run.metrics["steps"], run.metrics["critic_loss"]),
     ):

@@ -79,8 +79,8 @@ def test_what_cannot_be_trained_on_is_refused_in_one_line_that_says_why(name, ar
     assert "\n" not in str(caught.value)
 
 
-def test_making_a_v4_environment_leaves_no_file_and_no_word_on_the_terminal(tmp_path):
-    """In a process of its own, with a simulation that diverges, which MuJoCo warns about."""
+def test_a_v4_environment_leaves_no_file_and_no_word_on_the_terminal(tmp_path):
+    """A process of its own makes it, with a simulation that diverges, which MuJoCo warns about."""
     script = """
 import numpy as np
 from saclab.environments.make import make_environment

@@ -60,7 +60,8 @@ def test_a_terminal_state_at_the_time_limit_is_terminal():
     assert ended[-1][0].terminated
 
 
-def test_an_ended_episode_has_its_sum_of_rewards_and_length_and_the_next_starts_from_zero():
+def test_an_ended_episode_has_its_return_and_length():
+    """The next one starts from zero."""
     environments = counting(terminate_at=3)
     _, ended = walk(environments, 7)
     assert [[(e.environment, e.total_reward, e.length) for e in at_step] for at_step in ended] == [
@@ -94,7 +95,7 @@ def test_what_was_handed_out_does_not_change_with_later_steps():
         np.testing.assert_array_equal(column, copy)
 
 
-def test_transitions_are_stored_with_the_action_in_the_unit_range_and_32_bits():
+def test_transitions_hold_the_action_in_the_unit_range_and_32_bits():
     environments = counting(low=(-4.0,), high=(2.0,))
     action = np.array([[0.25]], np.float32)
     transitions, _ = environments.step(action)
@@ -134,7 +135,8 @@ def test_a_value_that_is_not_finite_is_refused_with_its_place(broken, message, v
 
 
 @pytest.mark.parametrize("broken", ["observation", "reward"])
-def test_a_value_beyond_32_bits_is_refused_before_it_reaches_the_replay_buffer_as_infinity(broken):
+def test_a_value_beyond_32_bits_is_refused(broken):
+    """Otherwise it would reach the replay buffer as infinity."""
     environments = counting(broken_at=1, broken=broken, value=1e300)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, about the overflow

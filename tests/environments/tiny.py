@@ -122,7 +122,7 @@ class Fragile(Constant):
 
 
 class Odd(gymnasium.Env):
-    """Of the spaces that saclab refuses."""
+    """It has the spaces that saclab refuses."""
 
     def __init__(self, kind: str, render_mode: str | None = None) -> None:
         flat = Box(-1, 1, (2,))

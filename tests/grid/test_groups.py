@@ -173,7 +173,7 @@ def test_a_grid_begun_alone_goes_on_in_run_groups(tmp_path):
 
 def test_the_delay_of_a_run_group_is_the_users_choice(tmp_path):
     (cell,) = grid(tmp_path, seeds=1, acting_delay=1)[:1]
-    assert "one round of updates behind (acting_delay 1)" in resources.batch_note([cell], 4)
+    assert "one round of updates behind (acting_delay 1)" in resources.group_note([cell], 4)
 
 
 @pytest.mark.parametrize("present", [True, False])

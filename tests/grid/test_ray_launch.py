@@ -31,7 +31,7 @@ def grid(runs: Path) -> list[Cell]:
 
 
 class Lost(Exception):  # noqa: N818
-    """Of a worker or its machine."""
+    """What Ray says of a lost worker or machine."""
 
 
 def says(*messages: dict[str, Any], code: int | None = None) -> dict[str, Any]:

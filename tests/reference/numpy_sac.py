@@ -50,7 +50,7 @@ class Adam:
     learning_rate: float
     betas: tuple[float, float] = (0.9, 0.999)
     share: Callable[[int], float] = lambda step: 1.0
-    """Of the learning rate, after so many steps."""
+    """What is left of the learning rate after so many steps."""
     first: list[np.ndarray] = field(default_factory=list)
     second: list[np.ndarray] = field(default_factory=list)
     count: int = 0

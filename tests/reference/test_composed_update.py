@@ -71,7 +71,7 @@ def expected_ring(reference: NumpySac) -> np.ndarray:
 
 
 def assert_close(actual, expected, what: str) -> None:
-    """To the rounding of 32 bits over a dozen updates; a step of Adam is a hundred times as large."""
+    """They agree to the rounding of 32 bits over a dozen updates; a step of Adam is a hundred times as large."""
     np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=3e-6, err_msg=what)
 
 

@@ -24,8 +24,8 @@ SEVEN = {
 }  # fmt: skip
 
 
-def spaced(root, seed=0, name="averaged-spacing-200", **more):
-    return write_run(root, "averaged", seed, name=name, overrides=SPACED, **more)
+def spaced(root, seed=0, **more):
+    return write_run(root, "averaged", seed, name="averaged-spacing-200", overrides=SPACED, **more)
 
 
 def test_a_name_makes_other_settings_of_the_algorithm_an_arm(tmp_path):

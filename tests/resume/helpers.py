@@ -158,11 +158,11 @@ def kill(process: subprocess.Popen[str]) -> None:
     process.wait()
 
 
-def run(folder: Path, *arguments: str, threads: int | None = 1, status: int = 0) -> str:
-    """The output of `saclab` with these arguments, once it has ended with this status."""
+def run(folder: Path, *arguments: str, threads: int | None = 1) -> str:
+    """The output of `saclab` with these arguments, once it has ended well."""
     process = start(folder, *arguments, threads=threads)
     output, _ = process.communicate(timeout=300)
-    assert process.returncode == status, output
+    assert process.returncode == 0, output
     return output
 
 

@@ -20,7 +20,8 @@ FILES = ("manifest.json", "manifest.sha256", "learner.safetensors", "environment
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_any_flipped_bit_or_missing_end_is_seen_and_the_checkpoint_before_is_used(stage, folder, name):
+def test_any_flipped_bit_or_missing_end_is_seen(stage, folder, name):
+    """The checkpoint before is used then."""
     chance, path = random.Random(name), newest(folder) / name
     content = path.read_bytes()
     flips = [(position, 1 << chance.randrange(8)) for position in {0, len(content) - 2, chance.randrange(len(content))}]
@@ -48,7 +49,8 @@ def test_the_run_goes_on_from_the_one_before_to_the_same_end(stage, folder):
     assert any("is damaged" in note for note in session["notes"])
 
 
-def test_two_damaged_checkpoints_are_an_error_that_names_both_and_touches_nothing(stage, folder):
+def test_two_damaged_checkpoints_are_an_error_that_names_both(stage, folder):
+    """Nothing is touched."""
     for path in newest_first(folder / "checkpoints"):
         (path / "learner.safetensors").write_bytes(b"")
     before = sorted(folder.rglob("*"))

@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +19,7 @@ from saclab.protocols import make_config
 from saclab.training import checkpoint, failure, loop, run_writer
 from saclab.training.checkpoint import newest_first, read_manifest
 from saclab.training.common_checkpoint import load_newest_checkpoint
-from saclab.training.events import Warned
+from saclab.training.events import UpdatesLogged, Warned
 from saclab.training.local_engine import LocalBuilder, LocalEngine
 from saclab.training.requests import Requests
 from saclab.training.snapshot import to_checkpoint
@@ -87,7 +86,7 @@ def test_an_update_that_breaks_is_named_and_the_environment_is_not_blamed(tmp_pa
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_learner_that_is_not_finite_is_not_saved(tmp_path, value):
+def test_a_learner_that_is_not_finite_is_not_saved(value):
     engine = LocalEngine.new(small_config("Pendulum-v1"))
     critic = engine.learner_state.critic
     broken_critic = critic._replace(weights=critic.weights.at[0, 0].set(value))
@@ -123,9 +122,15 @@ def test_a_runaway_temperature_is_told_once_with_advice(tmp_path, monkeypatch, s
 
 
 @pytest.mark.parametrize("temperature", [1e-9, 1.0, 1e9])
-def test_a_fixed_temperature_is_no_news(temperature):
-    session = SimpleNamespace(warned_of_temperature=False, run=SimpleNamespace(config=small_config("Any-v0", "sac")))
-    assert list(run_writer.RunWriter._watch_temperature(session, temperature)) == []
+def test_a_fixed_temperature_is_no_news(tmp_path, temperature):
+    config = small_config(
+        "Pendulum-v1", "sac", initial_temperature=temperature, max_steps=80, evaluation_interval_steps=1_000
+    )
+    events = list(loop.train(config, tmp_path))
+    assert [event.means["temperature"] for event in events if isinstance(event, UpdatesLogged)] == pytest.approx(
+        [temperature] * 2, rel=1e-5
+    )
+    assert not any(isinstance(event, Warned) for event in events)
 
 
 # --- memory
@@ -157,7 +162,8 @@ print(replay_bytes(capacity, layout), resident() - before, empty)
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system does not tell a process's memory")
-def test_the_forecast_of_the_replay_buffer_is_within_5_percent_of_what_a_full_one_takes():
+def test_a_replay_buffer_takes_the_memory_that_was_forecast():
+    """A full one takes it, within 5 percent."""
     result = subprocess.run(
         [sys.executable, "-c", FILL], capture_output=True, text=True, timeout=60, env=environment_of(1), check=True
     )

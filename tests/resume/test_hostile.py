@@ -62,7 +62,8 @@ def tensor_file(kind: str, shape: list[int], offsets: list[int]) -> bytes:
 
 @pytest.mark.parametrize("content", HOSTILE)
 @pytest.mark.parametrize("name", ["learner.safetensors", "replay-0000.safetensors"])
-def test_a_file_made_to_harm_is_refused_unread_though_its_checksum_is_right(stage, folder, tmp_path, name, content):
+def test_a_file_made_to_harm_is_refused_unread(stage, folder, tmp_path, name, content):
+    """Its checksum is right."""
     harm = tmp_path / "harmed"
     put(newest(folder), name, HOSTILE[content](Harm(harm)))
     started = stage.continue_from(folder)
@@ -167,7 +168,7 @@ def with_entry(value: dict, path: tuple, *new: object) -> dict:
 
 
 @pytest.mark.parametrize("count", [40, pytest.param(600, marks=pytest.mark.slow)])
-def test_any_other_value_in_any_place_of_the_manifest_is_an_error_in_words(stage, folder, count):
+def test_any_other_value_in_the_manifest_is_an_error_in_words(stage, folder, count):
     """Every entry replaced by values of every kind, or removed, with the right checksum: never a traceback."""
     manifest = json.loads((newest(folder) / "manifest.json").read_text())
     shutil.rmtree(older(folder))
@@ -188,7 +189,8 @@ def test_any_other_value_in_any_place_of_the_manifest_is_an_error_in_words(stage
     assert stage.continue_from(folder).resumed_at_step == SECOND
 
 
-def test_any_other_value_in_the_configuration_is_a_valid_one_or_an_error_in_words(folder):
+def test_any_other_value_in_the_configuration_is_read_or_refused(folder):
+    """Read as it stands, or refused with an error in words: never a traceback."""
     path = folder / "config.json"
     config = json.loads(path.read_text())
     outcomes = {"read": 0, "refused": 0}
@@ -198,10 +200,12 @@ def test_any_other_value_in_the_configuration_is_a_valid_one_or_an_error_in_word
             path.write_text(json.dumps(changed))
             try:
                 read = read_config(folder).to_dict()
-                assert new in ((), ({},)) or read == changed["config"], place  # what is missing has its default
                 outcomes["read"] += 1
             except UserError:
                 outcomes["refused"] += 1
+                continue
+            if new not in ((), ({},)):  # what is missing has its default
+                assert read == changed["config"], place
     assert min(outcomes.values()) > 50, outcomes
 
 
@@ -216,7 +220,7 @@ def test_a_damaged_description_is_named(stage, folder, name, content):
 
 
 @pytest.mark.parametrize("content", HOSTILE)
-def test_a_policy_made_to_harm_is_refused(stage, folder, tmp_path, content):
+def test_a_policy_made_to_harm_is_refused(folder, tmp_path, content):
     harm = tmp_path / "harmed"
     (folder / "best" / "policy.safetensors").write_bytes(HOSTILE[content](Harm(harm)))
     with pytest.raises(UserError, match="is damaged"):

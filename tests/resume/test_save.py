@@ -15,7 +15,8 @@ from saclab.training.events import Interrupted
 from .helpers import environment_of, small_config
 
 
-def test_a_process_that_dies_at_any_system_call_of_a_save_leaves_the_old_or_the_new_checkpoint():
+def test_death_at_any_system_call_of_a_save_leaves_a_whole_checkpoint():
+    """The old one or the new one."""
     program = Path(__file__).with_name("kill_at_every_call.py")
     result = subprocess.run(
         [sys.executable, str(program)], capture_output=True, text=True, timeout=120, env=environment_of(1)

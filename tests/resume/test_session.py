@@ -23,6 +23,7 @@ from saclab.training import local_engine, loop
 from saclab.training.checkpoint import CheckpointError, newest_first
 from saclab.training.events import Saved, Started, Warned
 from saclab.training.lock import locked
+from saclab.training.run_folder import read_config
 
 from .helpers import finish, lines_of, small_config, stop_at
 from .stage import SECOND, newest, sign
@@ -37,7 +38,8 @@ with locked(Path(sys.argv[1])):
 """
 
 
-def test_a_second_process_is_refused_with_the_firsts_id_and_a_dead_ones_lock_is_taken_over(tmp_path):
+def test_a_second_process_is_refused_with_the_id_of_the_first(tmp_path):
+    """The lock of a dead one is taken over."""
     first = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     try:
         assert first.stdout is not None
@@ -99,7 +101,7 @@ def test_another_machine_is_told_with_the_setting_to_use(stage, folder, name, be
 
 
 def test_a_checkpoint_without_facts_is_read(stage, folder):
-    """As one from before a fact was recorded."""
+    """It comes from before a fact was recorded."""
     manifest = json.loads((newest(folder) / "manifest.json").read_text())
     del manifest["state"]["facts"]["machine"]["numpy_threads"]
     sign(newest(folder), manifest)
@@ -110,10 +112,15 @@ def test_the_same_machine_has_nothing_to_tell(stage, folder):
     assert len(stage.continue_from(folder).notes) == 1
 
 
-@pytest.mark.parametrize(("value", "threads"), [("3", 3), ("", None), ("many", None), ("0", None), ("-2", None)])
-def test_threads_are_those_of_the_environment_if_it_names_some(monkeypatch, value, threads):
+def test_threads_are_those_of_the_environment_if_it_names_some(monkeypatch):
+    monkeypatch.setenv("NPROC", "3")
+    assert visible_threads("NPROC") == 3
+
+
+@pytest.mark.parametrize("value", ["", "many", "0", "-2"])
+def test_threads_are_as_many_as_cores_if_the_environment_names_none(monkeypatch, value):
     monkeypatch.setenv("NPROC", value)
-    assert visible_threads("NPROC") == (threads or len(os.sched_getaffinity(0)))
+    assert visible_threads("NPROC") == len(os.sched_getaffinity(0))
 
 
 @pytest.mark.parametrize("number", [0, 3, "1", None, 10**30])
@@ -131,8 +138,6 @@ GOLDEN = Path(__file__).with_name("golden") / "format-1"
 def test_a_checkpoint_of_format_1_is_still_read_and_continues(tmp_path):
     """The folder was written by the first version; it must be readable for ever."""
     folder = Path(shutil.copytree(GOLDEN, tmp_path / "run"))
-    from saclab.training.run_folder import read_config
-
     events = finish(read_config(folder), folder)
     assert isinstance(events[0], Started)
     assert events[0].resumed_at_step == 120
@@ -140,13 +145,13 @@ def test_a_checkpoint_of_format_1_is_still_read_and_continues(tmp_path):
     result = json.loads((folder / "result.json").read_text())
     assert (result["steps"], result["updates"]) == (150, 45)
     assert lines_of(folder / "metrics.jsonl")[:4] == lines_of(GOLDEN / "metrics.jsonl")
-    assert sum(path.stat().st_size for path in GOLDEN.rglob("*") if path.is_file()) < 100_000
 
 
 # --- environments that cannot be captured
 
 
-def test_an_environment_that_cannot_be_captured_starts_a_new_episode_which_is_told_and_recorded(tmp_path):
+def test_an_environment_that_cannot_be_captured_starts_a_new_episode(tmp_path):
+    """That is told and recorded."""
     config = small_config("Counting-v0", environments=2, hidden_layers=(8,))
     stop_at(123 + 1, config, tmp_path)
     events = finish(config, tmp_path)
@@ -219,7 +224,7 @@ def test_wrappers_without_a_state_are_no_hindrance(wrapper):
     assert capture_state(environment) is not None
 
     class Subclass(wrapper):
-        """Which might keep something."""
+        """It might keep something."""
 
     other = Subclass(make_environment("Pendulum-v1"))
     other.reset(seed=0)

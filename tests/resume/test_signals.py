@@ -36,7 +36,8 @@ def assert_whole(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_usr1_saves_and_goes_on_and_term_saves_and_stops_however_often_it_comes(tmp_path):
+def test_usr1_saves_and_goes_on_and_term_saves_and_stops(tmp_path):
+    """However often they come."""
     process = started(tmp_path)
     process.send_signal(signal.SIGUSR1)
     wait_for(lambda: len(newest_first(tmp_path / RUN / "checkpoints")) == 1)
@@ -103,7 +104,8 @@ def interrupted(folder: Path, threads: int):
 
 
 @pytest.mark.slow
-def test_another_number_of_threads_is_told_with_the_setting_that_continues_exactly(tmp_path):
+def test_another_number_of_threads_is_told_with_the_way_out(tmp_path):
+    """The setting that continues exactly."""
     _, folder = interrupted(tmp_path / "broken", 1)
     output = run(tmp_path, "resume", str(folder), "--threads", "2", threads=None)
     assert "threads was 1 when the checkpoint was made and is 2 now" in output

@@ -89,7 +89,8 @@ def test_before_and_after_an_evaluation_is_the_same_step(runs):
 
 
 @pytest.mark.parametrize("together", [False, True])
-def test_a_damaged_checkpoint_after_an_evaluation_costs_no_more_than_the_evaluation(runs, together):
+def test_a_damaged_checkpoint_after_an_evaluation_costs_the_evaluation(runs, together):
+    """It costs no more than that."""
     first, second = runs
     save(first, 8, evaluate_first=True)
     damage(save(first, 8))

@@ -1,4 +1,4 @@
-"""Test episodes stepped side by side are the episodes that each would be alone."""
+"""Evaluation episodes stepped side by side are the episodes that each would be alone."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_an_evaluator_gives_the_same_again_whatever_it_ran_before():
     assert first.total_rewards.tolist() == again.total_rewards.tolist() == backwards.total_rewards.tolist()[::-1]
 
 
-def test_the_policy_is_asked_once_per_step_and_only_for_episodes_that_go_on():
+def test_the_policy_is_asked_once_per_step_for_episodes_that_go_on():
     act, asked = linear_policy("Hopper-v4"), []
 
     def counting(observation):

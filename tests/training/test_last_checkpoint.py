@@ -22,7 +22,8 @@ def last_counters(folder: Path, checkpoint_minutes: float) -> dict[str, object]:
     return {name: value for name, value in counters.items() if name != "seconds"}
 
 
-def test_the_last_checkpoint_is_the_one_after_the_last_test_however_often_the_run_was_saved(tmp_path: Path) -> None:
+def test_the_last_checkpoint_is_the_one_after_the_last_evaluation(tmp_path: Path) -> None:
+    """However often the run was saved."""
     always, once = last_counters(tmp_path / "always", 0.0), last_counters(tmp_path / "once", 10.0)
     assert always == once
     assert (once["evaluations"], once["evaluated_at_update"]) == (3, 30)  # at steps 60 and 120, and at the end

@@ -9,7 +9,7 @@ import pytest
 import saclab
 from saclab.variants import VARIANTS
 
-SOLVED = -200.0  # mean test return of Pendulum-v1 that counts as solved; a random policy has about -1200
+SOLVED = -200.0  # mean evaluation return of Pendulum-v1 that counts as solved; a random policy has about -1200
 SEEDS = 2
 
 

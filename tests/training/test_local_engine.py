@@ -98,7 +98,8 @@ def test_parallel_environments_keep_the_ratio_of_updates_to_steps(count, shared)
             assert len(engine.run.window) == engine.run.window_size == counters.updates
 
 
-def test_actions_are_uniform_during_the_random_steps_and_then_the_policys_and_all_is_stored_as_it_was():
+def test_actions_are_uniform_at_first_and_then_the_policys():
+    """All of a transition is stored as it was."""
     engine = LocalEngine.new(tiny_config(max_updates=1))
     stream = seeds.generator(engine.run.config.seed, "exploration")
     expected = [stream.uniform(-1, 1, (1, 1)).astype(np.float32) for _ in range(12)]

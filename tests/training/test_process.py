@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+import jax
 
 from saclab.training import process
 
@@ -70,16 +70,14 @@ def test_another_number_of_threads_has_a_folder_of_its_own(monkeypatch):
 
 def test_a_folder_of_the_users_own_is_respected(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(process.jax, "config", Config(jax_compilation_cache_dir="/mine"))
-    process.use_compilation_cache()
+    users = {"jax_enable_compilation_cache": True, "jax_compilation_cache_dir": str(tmp_path / "mine")}
+    before = {name: getattr(jax.config, name) for name in users}
+    try:
+        for name, value in users.items():
+            jax.config.update(name, value)
+        process.use_compilation_cache()
+        assert {name: getattr(jax.config, name) for name in users} == users
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
     assert not any(tmp_path.iterdir())
-
-
-class Config:
-    jax_enable_compilation_cache = True
-
-    def __init__(self, jax_compilation_cache_dir: str | None) -> None:
-        self.jax_compilation_cache_dir = jax_compilation_cache_dir
-
-    def update(self, name: str, value: object) -> None:
-        pytest.fail(f"{name} was changed")

@@ -154,7 +154,7 @@ for event in train(Config.from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]))
     assert_same_run(expected, folder)
 
 
-def test_a_damaged_newest_checkpoint_costs_only_the_steps_since_the_one_before(straight_runs, tmp_path):
+def test_a_damaged_checkpoint_costs_only_the_steps_since_the_one_before(straight_runs, tmp_path):
     config, expected = straight_runs("Pendulum-v1")
     folder, requests, saves = tmp_path / "damaged", Requests(), 0
     events = train(config, folder, requests)

@@ -25,7 +25,7 @@ def with_settings(run: RunState, **changes) -> None:
     run.config = dataclasses.replace(run.config, training=dataclasses.replace(run.config.training, **changes))
 
 
-def test_each_evaluation_has_episodes_of_its_own_and_the_best_policy_is_kept(run):
+def test_evaluations_have_their_own_episodes_and_keep_the_best_policy(run):
     seen = []
 
     def enter(rewards, policy):

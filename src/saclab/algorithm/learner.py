@@ -44,7 +44,7 @@ class Learner(NamedTuple):
     """A variant of SAC for one shape of observations and actions, as pure functions."""
 
     init: Callable[[Scalars, jax.Array], LearnerState]
-    """From a key u32[2] (`jax.random.PRNGKey`)."""
+    """(plain numbers, key u32[2]) -> the state before the first update; the key is a `jax.random.PRNGKey`."""
     update: Callable[[Scalars, LearnerState, Batch, Context], LearnerState]
     """A body for jit and `lax.scan`; `jax.vmap` runs many learners at once."""
     policy: Policy

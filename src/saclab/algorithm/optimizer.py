@@ -32,7 +32,7 @@ class Trainer(NamedTuple):
     """What is done to the weights after the step."""
 
     def start(self, weights: jax.Array) -> Trained:
-        """With moments of zero."""
+        """Begin with moments of zero."""
         return Trained(weights, optax.scale_by_adam().init(weights))
 
 

@@ -43,7 +43,7 @@ class Policy(NamedTuple):
         return squash(mean, log_std, noise)
 
     def train_sample(self, parameters: Array, observation: Array, noise: Array, key: Array) -> tuple[Array, ...]:
-        """As `sample`, while the network learns; also the running statistics f32[S] that follow."""
+        """What `sample` gives, while the network learns, and the running statistics f32[S] that follow."""
         output, statistics = self.network.train(parameters, observation, key=key)
         return *squash(*self._distribution(output), noise), statistics
 

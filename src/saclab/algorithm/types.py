@@ -42,7 +42,7 @@ class Trained(NamedTuple):
     weights: jax.Array
     """f32[...]."""
     moments: Any
-    """Of Adam: count i32[], mu and nu of the weights' shape."""
+    """Adam's: count i32[], mu and nu of the weights' shape."""
 
 
 class LearnerState(NamedTuple):

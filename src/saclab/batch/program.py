@@ -76,7 +76,7 @@ class Program:
     """The two functions for one structure of runs."""
 
     def __init__(self, settings: AlgorithmSettings, layout: RowLayout, environments: int, slots: int) -> None:
-        """For at least `slots` slots: as many as can be spread evenly over the devices.
+        """Make room for at least `slots` slots: as many as can be spread evenly over the devices.
 
         Args:
             settings: the `structure` of the runs' settings.

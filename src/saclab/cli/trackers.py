@@ -24,7 +24,7 @@ def scalars(event: events.Event) -> tuple[dict[str, float], int] | None:
         case events.Evaluated():
             returns = event.total_rewards
             values = {"mean_return": returns.mean(), "minimum": returns.min(), "maximum": returns.max()}
-            return {f"test/{name}": float(value) for name, value in values.items()}, event.steps
+            return {f"evaluation/{name}": float(value) for name, value in values.items()}, event.steps
     return None
 
 

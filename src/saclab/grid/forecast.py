@@ -27,7 +27,7 @@ class Cost(NamedTuple):
     """Seconds, measured."""
 
     per_update: float
-    """With the environment steps that belong to it."""
+    """One update, with the environment steps that belong to it."""
     per_step: float
     """One environment step alone."""
 
@@ -37,9 +37,9 @@ class Kind(NamedTuple):
 
     configs: tuple[Config, ...]
     slots: int
-    """Room of the group's program; 0 for a run alone."""
+    """Room of the run group's program; 0 for a run alone."""
     workers: int
-    """Processes that step the environments of a group."""
+    """Processes that step the environments of a run group."""
 
 
 def forecast_hours(cells: Sequence[Cell], workers: int, threads: int, batch: int = 0) -> float:
@@ -105,7 +105,7 @@ def measure_in_process(kinds: Sequence[Kind], threads: int) -> list[Cost]:
 
 
 def measure(kind: Kind) -> Cost:
-    """Train for a moment: nothing is written. In a group, an update is one of all its runs."""
+    """Train for a moment: nothing is written. In a run group, an update is one of all its runs."""
     from saclab.training.engine import build_new
     from saclab.training.process import prepare_process
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from saclab.config import group_key
 from saclab.grid.plan import Cell
-from saclab.training.common_checkpoint import batch_slots, checkpoint_steps
+from saclab.training.common_checkpoint import checkpoint_steps, group_slots
 from saclab.training.run_folder import FAILURE
 
 NO_CHECKPOINT = -1  # in place of a step: one of step 0 is something else
@@ -19,7 +19,7 @@ class RunGroup(NamedTuple):
     members: list[int]
     """Places of the runs in the sequence that was given."""
     slots: int
-    """As many as runs, or as the run group had from which they are continued."""
+    """There are as many as runs, or as the run group had from which they are continued."""
 
 
 def run_groups(cells: Sequence[Cell], size: int) -> list[RunGroup]:
@@ -55,4 +55,4 @@ def by_progress(cells: Sequence[Cell], members: Sequence[int]) -> list[list[int]
 
 def slots_before(cells: Sequence[Cell], members: Sequence[int]) -> int:
     """Slots of the run group in which these runs were last; 0 if they were in none."""
-    return max(batch_slots(cells[index].folder) for index in members)
+    return max(group_slots(cells[index].folder) for index in members)

@@ -50,7 +50,7 @@ class Resources(NamedTuple):
 
     def note(self, cells: Sequence[Cell]) -> str:
         """What a user should know of a grid that is trained in run groups; empty if each run is trained alone."""
-        return batch_note(cells, self.batch) if self.batch else ""
+        return group_note(cells, self.batch) if self.batch else ""
 
 
 def chosen_resources(
@@ -89,7 +89,7 @@ def chosen_batch(batch: int | None, launcher: str = "local", ray_gpus: float = 0
     return batch
 
 
-def batch_note(cells: Sequence[Cell], batch: int) -> str:
+def group_note(cells: Sequence[Cell], batch: int) -> str:
     """What a user should know of a grid that is trained in run groups of at most `batch`."""
     from saclab.training.starts import ratio_note
 

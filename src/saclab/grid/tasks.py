@@ -119,7 +119,7 @@ def make_statuses(cells: Sequence[Cell]) -> list[RunStatus]:
 
 
 def make_tasks(statuses: Sequence[RunStatus], batch: int) -> list[Task]:
-    """The unfinished runs, each alone, or up to `batch` of the same structure as one group; in the grid's order."""
+    """The unfinished runs, each alone, or up to `batch` of the same structure as one run group; in the grid's order."""
     waiting = [status for status in statuses if status.status == "waiting"]
     if batch == 0:
         return [Task([status], 0) for status in waiting]

@@ -58,7 +58,7 @@ def page_data(
         "axes": AXES,
         "axis": "episodes" if all(run.config.protocol == "paper" for run in comparison.runs) else "steps",
         "arms": [{"title": arm.title} for arm in comparison.arms],
-        "environments": [environment_data(comparison, entry, curves, places, pool) for entry in scores],
+        "environments": [environment_data(entry, curves, places, pool) for entry in scores],
         "together": together_data(together, places),
         "pool": pool.axes,
     }
@@ -73,7 +73,7 @@ def script_safe(text: str) -> str:
 
 
 def environment_data(
-    comparison: Comparison, entry: EnvironmentScores, curves: Curves, places: dict[Arm, int], pool: AxisPool
+    entry: EnvironmentScores, curves: Curves, places: dict[Arm, int], pool: AxisPool
 ) -> dict[str, Any]:
     name = entry.environment
     diagnostics = logged(curves, name, DIAGNOSTICS)

@@ -18,7 +18,6 @@ from saclab.report.statistics import (
     area_under_curve,
     bootstrap_interval,
     interquartile_mean,
-    mean,
     median,
     normalise,
     performance_profile,
@@ -56,8 +55,6 @@ class ArmScores(NamedTuple):
     """Interquartile means with 95 % intervals, here and below."""
     best: Interval
     area: Interval
-    final_mean: Interval
-    final_median: Interval
     steps_to_threshold: Interval
     """Median over runs."""
     reached: int
@@ -94,8 +91,6 @@ class AggregateArm(NamedTuple):
 
     arm: Arm
     interquartile_mean: Interval
-    mean: Interval
-    median: Interval
     profile: Band
 
 
@@ -172,8 +167,6 @@ def score_arm(environment: str, arm: Arm, runs: Sequence[RunScore], thresholds: 
         final=bootstrap_interval([final]),
         best=bootstrap_interval([values("best")]),
         area=bootstrap_interval([values("area")]),
-        final_mean=bootstrap_interval([final], mean),
-        final_median=bootstrap_interval([final], median),
         steps_to_threshold=bootstrap_interval([to_threshold], median),
         reached=int(np.sum(np.isfinite(to_threshold))),
         paper_best=TABLE_2.get(environment, {}).get(arm.paper_name or ""),
@@ -198,7 +191,6 @@ def aggregate(environments: Sequence[EnvironmentScores]) -> AggregateScores | No
     for arm in shared:
         strata = [normalise(entry[arm].values("final"), scores.thresholds[0], scores.thresholds[-1])
                   for entry, scores in zip(complete, environments)]  # fmt: skip
-        iqm, average, middle = (bootstrap_interval(strata, each) for each in (interquartile_mean, mean, median))
-        arms.append(AggregateArm(arm, iqm, average, middle, performance_profile(strata, thresholds)))
+        arms.append(AggregateArm(arm, bootstrap_interval(strata), performance_profile(strata, thresholds)))
     pairs = compare_pairs([{arm: entry[arm].by_seed for arm in shared} for entry in complete])
     return AggregateScores(tuple(arms), pairs, thresholds)

@@ -16,7 +16,7 @@ from scipy import optimize, stats
 
 CONFIDENCE = 0.95
 POWER = 0.8
-RESAMPLES = 5000
+RESAMPLES, BAND_RESAMPLES = 5000, 1000
 SEED = 20210830
 FEW_RUNS = 5
 """Below so many runs a percentile bootstrap is clearly too narrow (for 2 runs it covers about half)."""
@@ -122,16 +122,14 @@ def bootstrap_interval(strata: Sequence[np.ndarray], statistic: Statistic = inte
     return Interval(estimate, float(low), float(high), runs)
 
 
-def bootstrap_band(
-    strata: Sequence[np.ndarray], statistic: Statistic = interquartile_mean, resamples: int = 1000
-) -> Band:
+def bootstrap_band(strata: Sequence[np.ndarray], statistic: Statistic = interquartile_mean) -> Band:
     """A statistic of curves f64[R_e, T] at each point, whole runs resampled within each environment."""
     values = np.concatenate(list(strata))
     middle = statistic(values, 0)
     if min(len(stratum) for stratum in strata) < 2:
         nothing = np.full(middle.shape, np.nan)
         return Band(middle, nothing, nothing, len(values))
-    low, high = percentiles(statistic(np.concatenate(resample(strata, resamples), axis=1), 1))
+    low, high = percentiles(statistic(np.concatenate(resample(strata, BAND_RESAMPLES), axis=1), 1))
     return Band(middle, low, high, len(values))
 
 

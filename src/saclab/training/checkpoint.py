@@ -57,7 +57,7 @@ class Checkpoint(NamedTuple):
     transitions: int = 0
     """Transitions added to the replay buffer since the start of the run."""
     format: int = FORMAT
-    """As it was written; the groups are as of today."""
+    """The format that it was written in; the groups are those of today's."""
 
 
 class Replay(Protocol):
@@ -127,7 +127,7 @@ def cannot_save(final: Path, error: OSError) -> str:
 
 
 def set_aside(checkpoint: Path, suffix: str) -> None:
-    """From now on it is none."""
+    """Rename a checkpoint, so that it is none from now on."""
     shutil.rmtree(checkpoint.with_suffix(suffix), ignore_errors=True)
     checkpoint.rename(checkpoint.with_suffix(suffix))
 

@@ -26,8 +26,8 @@ def checkpoint_steps(run: Path) -> list[int]:
     return [step_of(path) for path in newest_first(run / "checkpoints")]
 
 
-def batch_slots(run: Path) -> int:
-    """Slots of the group in which a run was saved last, or begun; 0 if it was not begun, or is alone."""
+def group_slots(run: Path) -> int:
+    """Slots of the run group in which a run was saved last, or begun; 0 if it was not begun, or is alone."""
     for path in newest_first(run / "checkpoints"):
         with suppress(CheckpointError, OSError):
             return slots_among(read_manifest(path)["state"].get("facts"))
@@ -120,6 +120,6 @@ def nothing_in_common(
         for folder, steps in zip(folders, by_step, strict=True)
     ]
     return (
-        f"the runs of the group have no whole checkpoint of the same step: {'; '.join(problems)}. Continue them each "
-        "alone (--batch 0), or in groups of those that are equally far"
+        f"the runs of the run group have no whole checkpoint of the same step: {'; '.join(problems)}. Continue them "
+        "each alone (--batch 0), or in run groups of those that are equally far"
     )

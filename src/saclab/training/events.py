@@ -76,7 +76,7 @@ class Finished(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """A run met a number that is not finite, or its environment broke; the others of its group go on."""
+    """A run met a number that is not finite, or its environment broke; the others of its run group go on."""
 
     message: str
 

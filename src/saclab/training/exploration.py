@@ -30,7 +30,7 @@ class Exploration:
         """f64[longest_noise]: the probability of each number of steps."""
         self.held = np.zeros(self.shape, np.float32)
         self.steps_left = np.zeros(environments, np.int64)
-        """For which `held` is kept, by environment."""
+        """i64[N]: how many steps `held` is kept for."""
 
     def uniform_action(self) -> np.ndarray:
         """f32[N, A] in [-1, 1]."""

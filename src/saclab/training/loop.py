@@ -119,7 +119,7 @@ class Session:
         self.last_save = self.last_progress = time.monotonic()
 
     def events(self) -> Told:
-        """Until every run has finished or failed, or a request to stop."""
+        """Train until every run has finished or failed, or until a request to stop."""
         for run in self.active:
             writer = self.writers[run]
             yield run, Started(writer.folder, writer.resumed_at_step, tuple(writer.notes))

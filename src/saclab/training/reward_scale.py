@@ -16,7 +16,7 @@ FIRST_COUNT = 1e-4  # of the start's variance of 1
 
 
 class RewardScale:
-    """Of one run, over its N environments."""
+    """What divides the rewards of one run, over its N environments."""
 
     def __init__(self, kind: str, environments: int, discount: float, bound: float) -> None:
         """The state before the first step.
@@ -57,7 +57,7 @@ class RewardScale:
 
     @property
     def value(self) -> np.float32:
-        """By which rewards are divided now."""
+        """What rewards are divided by now."""
         if not self.active:
             return np.float32(1)
         variance = self.moments[2]

@@ -141,7 +141,7 @@ class RunState:
         return None
 
     def fraction_done(self) -> float:
-        """By the nearest of the limits, patience aside."""
+        """The share of the run that is done, by the nearest of its limits, patience aside."""
         training, counters = self.config.training, self.counters
         shares = [
             done / limit

@@ -94,13 +94,13 @@ def initial(shape: Shape, key: jax.Array) -> jax.Array:
 
 
 def apply(shape: Shape, vector: Array, *inputs: Array) -> Array:
-    """As it acts: by the running moments."""
+    """The network as it acts: normalised by the running moments."""
     layers = shape.unpack(vector)
     return forward(shape, layers, inputs, lambda number, x: layers.running[number])
 
 
 def train(shape: Shape, vector: jax.Array, *inputs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """As it learns: by the moments of the batch, towards which the running ones move."""
+    """The network as it learns: normalised by the moments of the batch, towards which the running ones move."""
     layers, moved = shape.unpack(vector), []
 
     def moments(number: int, x: jax.Array) -> tuple[jax.Array, jax.Array]:

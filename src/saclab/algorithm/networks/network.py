@@ -27,7 +27,7 @@ class Network(NamedTuple):
     """
 
     init: Callable[[jax.Array], jax.Array]
-    """From a key."""
+    """key u32[2] -> f32[P], before the first step."""
     apply: Callable[..., Array]
     """(f32[P], *inputs) -> f32[..., outputs], as the network acts: with its running statistics."""
     train: Callable[..., tuple[jax.Array, jax.Array]]

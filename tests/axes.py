@@ -8,7 +8,8 @@ AXES: dict[str, dict[str, Any]] = {
     "held noise and scaled rewards": {"longest_noise": 16, "reward_scaling": "deviation_or_bound"},
     "reward terms": {"reward_terms": ("reward_run", "reward_ctrl"), "reward_weights": (0.5, 2.0)},
     "batch normalisation, joint, without a target": {
-        "network": "batch_norm_mlp", "joint_forward": True, "snapshots": 0, "weight_projection": "unit_columns",
+        "network": "batch_norm_mlp", "joint_forward": True, "actor_joint_forward": True, "snapshots": 0,
+        "weight_projection": "unit_columns",
     },
     "a distribution, the actor first and now and then": {
         "critic_head": "categorical", "critic_atoms": 11, "actor_interval": 3,

@@ -85,7 +85,11 @@ MORE_CASES = {
         VARIANT_CASES["averaged-auto/mlp"], critic_head="categorical", critic_atoms=7, critic_bound=2.0
     ),
     "batch normalisation in one pass without a target network": dataclasses.replace(
-        VARIANT_CASES["sac-auto/mlp"], network="batch_norm_mlp", joint_forward=True, snapshots=0
+        VARIANT_CASES["sac-auto/mlp"],
+        network="batch_norm_mlp",
+        joint_forward=True,
+        snapshots=0,
+        actor_joint_forward=True,
     ),
     "batch normalisation of the critics, averaged distributions, unit columns": dataclasses.replace(
         VARIANT_CASES["averaged-auto/mlp"],

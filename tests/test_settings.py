@@ -8,12 +8,14 @@ from saclab.algorithm.heads import HEADS
 from saclab.algorithm.learner import UPDATES
 from saclab.algorithm.losses import FACTORS
 from saclab.algorithm.networks import NETWORKS
-from saclab.algorithm.networks.network import ACTIVATIONS
+from saclab.algorithm.networks.network import ACTIVATIONS, PROJECTIONS
 from saclab.algorithm.optimizer import SCHEDULES
+from saclab.algorithm.scalars import OF_THE_CONTEXT, scalars
 from saclab.algorithm.targets import REDUCTIONS
 from saclab.errors import SettingError
 from saclab.settings import UPDATES as UPDATE_NAMES
-from saclab.settings import AlgorithmSettings, choices
+from saclab.settings import AlgorithmSettings, choices, plain_numbers, structure
+from saclab.training.reward_scale import SCALES
 
 TABLES = {
     "network": NETWORKS,
@@ -24,15 +26,15 @@ TABLES = {
     "actor_reduction": REDUCTIONS,
     "learning_rate_schedule": SCHEDULES,
     "temperature_gradient": FACTORS,
+    "weight_projection": PROJECTIONS,
+    "reward_scaling": SCALES,
 }
 """Setting -> what its names stand for. `settings.py` imports no numerical library, so the names are written twice."""
-NO_TABLE = {"temperature", "weight_projection", "reward_scaling"}
+NO_TABLE = {"temperature"}  # two learning rates
 
 
-@pytest.mark.parametrize("setting", choices())
+@pytest.mark.parametrize("setting", TABLES)
 def test_the_names_of_a_setting_are_those_of_its_table(setting):
-    if setting in NO_TABLE:
-        return
     names = set(choices()[setting]) - {None}
     missing, unnamed = sorted(names - TABLES[setting].keys()), sorted(TABLES[setting].keys() - names)
     assert not missing, f"{setting}: settings.py names {missing}, and its table has no such entry"
@@ -59,3 +61,25 @@ def test_only_a_setting_that_may_be_left_out_can_be_none():
     assert AlgorithmSettings(critic_network=None).network_of_critic == "mlp"
     with pytest.raises(SettingError, match="network = None"):
         AlgorithmSettings(network=None)
+
+
+def test_every_plain_number_is_an_argument_of_the_update():
+    """One that is not would silently have its default in all that is compiled."""
+    assert plain_numbers()
+    assert set(plain_numbers()) - set(OF_THE_CONTEXT) == set(scalars(AlgorithmSettings(), 1)) - {"planned_updates"}
+    changed = AlgorithmSettings(discount=0.5, snapshot_interval=7, adam_beta_1=0.25, target_entropy=-9.0)
+    numbers = scalars(changed, 3)
+    assert (numbers["discount"], numbers["snapshot_interval"], numbers["adam_beta_1"]) == (0.5, 7, 0.25)
+    assert (numbers["target_entropy"], scalars(AlgorithmSettings(), 3)["target_entropy"]) == (-9, -3)
+    assert numbers["snapshot_interval"].dtype == "int32"
+
+
+def test_two_ways_to_say_the_same_structure_are_one():
+    said = AlgorithmSettings(critic_hidden_layers=(256, 256), critic_network="mlp", discount=0.5)
+    assert structure(said) == structure(AlgorithmSettings())
+
+
+def test_lists_are_as_good_as_tuples():
+    settings = AlgorithmSettings(hidden_layers=[8], reward_terms=["a"], reward_weights=[2.0])
+    assert settings == AlgorithmSettings(hidden_layers=(8,), reward_terms=("a",), reward_weights=(2.0,))
+    assert hash(settings)

@@ -53,9 +53,9 @@ class AlgorithmSettings:
     """Decay of Adam's second moment, of all that is trained."""
     learning_rate_schedule: Literal["constant", "linear", "cosine"] = "constant"
     """How the three learning rates go from their values to `final_learning_rate_share` of them over the run's updates.
-    Each counts the steps of its own optimizer."""
-    final_learning_rate_share: Real = 1.0
-    """What is left of the learning rates at the end of the schedule, in [0, 1]."""
+    Each counts the steps of its own optimizer: that of a policy with actor_interval n gets 1/n of the way."""
+    final_learning_rate_share: Real = 0.0
+    """What is left of the learning rates at the end of a schedule, in [0, 1]."""
 
     network: NetworkName = "mlp"
     """Architecture of the policy, and of the Q-networks unless `critic_network` says another."""
@@ -79,7 +79,9 @@ class AlgorithmSettings:
     critic_bound: float = 5.0
     """The largest value that the categorical head can represent."""
     joint_forward: bool = False
-    """Whether the critics see (s, a) and (s′, a′) in one pass, so that batch statistics are those of both."""
+    """Whether the critics learn in one pass over (s, a) and (s′, a′), so that batch statistics are those of both."""
+    actor_joint_forward: bool = False
+    """Whether the policy learns in one pass over s and s′, so that batch statistics are those of both."""
 
     polyak_rate: Real = 0.005
     """τ: share of the critic that enters its target at each update (Eq. 2)."""
@@ -130,6 +132,9 @@ class AlgorithmSettings:
     return, or the larger of it and the largest discounted return so far divided by `critic_bound`."""
 
     def __post_init__(self) -> None:
+        for name in field_names(type(self)):
+            if isinstance(value := getattr(self, name), list):  # as Python's users and JSON write them
+                object.__setattr__(self, name, tuple(value))
         require_ranges(self)
         require_possible(self)
 
@@ -300,10 +305,7 @@ def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settin
 
 def algorithm_from_json(values: Mapping[str, Any]) -> AlgorithmSettings:
     """The settings in a JSON object, where tuples are lists; raises SettingError for one that does not exist."""
-    return replace_settings(
-        AlgorithmSettings(),
-        {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()},
-    )
+    return replace_settings(AlgorithmSettings(), values)
 
 
 @lru_cache(maxsize=1)
@@ -330,4 +332,7 @@ def structure(settings: AlgorithmSettings) -> AlgorithmSettings:
     Whether α is learned is a plain number too: the learning rate of a fixed one is 0.
     """
     defaults = {name: getattr(AlgorithmSettings, name) for name in plain_numbers()}
-    return dataclasses.replace(settings, temperature="learned", **defaults)
+    return dataclasses.replace(
+        settings, temperature="learned", critic_network=settings.network_of_critic,
+        critic_hidden_layers=settings.layers_of_critic, **defaults,
+    )  # fmt: skip

@@ -43,3 +43,15 @@ def requests_from_signals(process_ends: bool = False) -> Iterator[Requests]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, signal.SIG_IGN if process_ends and requests.stop else handler)
+
+
+def how_it_ended(code: int, errors: str) -> str:
+    """The end of a process in words, with its last ones.
+
+    Args:
+        code: its exit status, below 0 for a signal.
+        errors: what it has written to its standard error.
+    """
+    how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+    last_words = [line.strip() for line in errors.splitlines() if line.strip()][-1:]
+    return ": ".join([how, *last_words])

@@ -189,6 +189,24 @@ def test_the_reward_is_the_weighted_sum_of_its_terms_over_the_scale(case_of):
     np.testing.assert_allclose(ours.report, case.update(state, same, 0).report, rtol=1e-5)
 
 
+def test_a_policy_that_learns_jointly_normalises_by_both_states(case_of):
+    """And its loss counts the first of them only."""
+    changes = {"network": "batch_norm_mlp", "hidden_layers": (8,)}
+    joint, apart = (case_of("sac/mlp", actor_joint_forward=both, **changes) for both in (True, False))
+    state, batch = joint.initial_state(), joint.batch(np.random.default_rng(0))
+    moved = batch._replace(next_observation=batch.next_observation + 5)
+    of_both, of_one = (case.update(state, moved, 0).actor.weights for case in (joint, apart))
+    network, size = joint.learner.policy.network, joint.settings.batch_size
+    means = np.asarray(of_both[network.size - network.statistics :][:3]) / 0.01  # of the inputs; they started at 0
+    both = np.concatenate([moved.observation, moved.next_observation])
+    np.testing.assert_allclose(means, both.mean(axis=0), rtol=1e-3)
+    assert len(both) == 2 * size
+    assert np.abs(of_both - of_one).max() > 1e-3
+    same = batch._replace(next_observation=batch.observation)  # the same moments, and so the same step
+    ours, theirs = (case.update(state, same, 0).report for case in (joint, apart))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
 def test_the_numpy_policy_of_a_trained_actor_acts_like_the_jax_one(variant):
     state = after(variant, 3)[0][-1]
     observation = np.random.default_rng(0).standard_normal((5, 3)).astype(np.float32)

@@ -16,7 +16,7 @@ from saclab.algorithm.networks.network import Array, Network
 from saclab.algorithm.optimizer import Trainer, descend
 from saclab.algorithm.policy import Policy, make_policy
 from saclab.algorithm.scalars import Scalars
-from saclab.algorithm.targets import REDUCTIONS, averaged_entropy, averaged_prediction, polyak_update
+from saclab.algorithm.targets import REDUCTIONS, averaged_entropy, averaged_prediction, polyak_update, reduced_q
 from saclab.algorithm.types import Batch, Context, LearnerState
 from saclab.settings import AlgorithmSettings
 
@@ -137,7 +137,8 @@ def update(parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, co
     return state._replace(report=jnp.stack([state.report[name] for name in names]))
 
 
-Passes = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+FOR_NETWORKS = 1  # folded into the key of a noise, it is that of the networks that draw something while they learn
+Passes = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 Update = Callable[[Parts, Scalars, LearnerState, Batch, Context, jax.Array], LearnerState]
 
 
@@ -146,6 +147,7 @@ def update_critic(
 ) -> LearnerState:
     """Eq. 3 with the value of Eq. 4 or 9."""
     key, _ = jax.random.split(key)
+    network_key = jax.random.fold_in(key, FOR_NETWORKS)
     next_noise = parts.noise(batch.next_observation, key)
     next_action, next_log_prob = parts.policy.sample(state.actor.weights, batch.next_observation, next_noise)
     entropy_term, entropy_terms = averaged_entropy(
@@ -155,7 +157,7 @@ def update_critic(
     discount = numbers["discount"] * (1 - batch.terminated)
 
     def objective(critic: jax.Array) -> tuple[jax.Array, tuple[jax.Array, dict[str, jax.Array]]]:
-        outputs, next_outputs, statistics = forward(parts, critic, state.targets, batch, next_action, key)
+        outputs, next_outputs, statistics = forward(parts, critic, state.targets, batch, next_action, network_key)
         predictions = parts.head.prediction(next_outputs)
         reduce = REDUCTIONS[parts.settings.target_reduction]
         prediction, snapshot_spread = averaged_prediction(predictions, parts.head.mean, reduce)
@@ -186,16 +188,28 @@ def forward(
     """
     now = jnp.concatenate([batch.observation, batch.action], axis=1)  # in one array: no gradient of the action is due
     then = jnp.concatenate([batch.next_observation, next_action], axis=1)
-    passes: Passes = jax.vmap(lambda critic, inputs: parts.q_network.train(critic, inputs, key=key), in_axes=(0, None))
-    of_targets: Passes = jax.vmap(passes, in_axes=(0, None))
+
+    def train(critic: jax.Array, inputs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return parts.q_network.train(critic, inputs, key=key)
+
+    count = parts.settings.critics
+    passes: Passes = jax.vmap(train, in_axes=(0, None, 0))  # each network draws its own
+    of_targets: Passes = jax.vmap(passes, in_axes=(0, None, 0))
+    own_keys, target_keys = jax.random.split(key, count), split_for(key, max(1, len(targets)), count)
     if not parts.settings.joint_forward:
-        outputs, statistics = passes(critic, now)
-        next_outputs, _ = of_targets(targets if len(targets) else critic[None], then)
+        outputs, statistics = passes(critic, now, own_keys)
+        next_outputs, _ = of_targets(targets if len(targets) else critic[None], then, target_keys)
         return outputs, next_outputs, statistics
     both, size = jnp.concatenate([now, then]), len(now)
-    outputs, statistics = passes(critic, both)
-    next_outputs = of_targets(targets, both)[0][..., size:, :] if len(targets) else outputs[None, :, size:]
+    outputs, statistics = passes(critic, both, own_keys)
+    next_outputs = of_targets(targets, both, target_keys)[0][..., size:, :] if len(targets) else outputs[None, :, size:]
     return outputs[:, :size], next_outputs, statistics
+
+
+def split_for(key: jax.Array, snapshots: int, critics: int) -> jax.Array:
+    """Keys u32[K, C, 2] for the target networks, other than those of the critics."""
+    keys: jax.Array = jax.random.split(jax.random.fold_in(key, FOR_NETWORKS), (snapshots, critics))
+    return keys
 
 
 def update_actor(
@@ -203,13 +217,17 @@ def update_actor(
 ) -> LearnerState:
     """Eq. 5 on the critics as they are now."""
     _, key = jax.random.split(key)
-    reduce, alpha = REDUCTIONS[parts.settings.actor_reduction], jnp.exp(state.temperature.weights)
+    alpha = jnp.exp(state.temperature.weights)
     noise = parts.noise(batch.observation, key)
+    joint = parts.settings.actor_joint_forward
+    seen = jnp.concatenate([batch.observation, batch.next_observation]) if joint else batch.observation
 
     def objective(actor: jax.Array) -> tuple[jax.Array, tuple[jax.Array, dict[str, jax.Array]]]:
-        action, log_prob, statistics = parts.policy.train_sample(actor, batch.observation, noise, key)
+        action, log_prob, statistics = parts.policy.train_sample(
+            actor, seen, noise, jax.random.fold_in(key, FOR_NETWORKS)
+        )
         q = parts.q(parts.q_outputs(state.critic.weights, batch.observation, action))
-        loss = actor_loss(log_prob, reduce(q[..., None], q)[:, 0], alpha)
+        loss = actor_loss(log_prob, reduced_q(parts.settings.actor_reduction, q), alpha)
         return loss, (statistics, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)})
 
     actor, (statistics, report) = descend(parts.actor_trainer, numbers, objective, state.actor)

@@ -43,9 +43,12 @@ class Policy(NamedTuple):
         return squash(mean, log_std, noise)
 
     def train_sample(self, parameters: Array, observation: Array, noise: Array, key: Array) -> tuple[Array, ...]:
-        """What `sample` gives, while the network learns, and the running statistics f32[S] that follow."""
+        """Do as `sample` while the network learns; also the running statistics f32[S] that follow.
+
+        Rows of the observations beyond those of `noise` only enter the statistics of the batch.
+        """
         output, statistics = self.network.train(parameters, observation, key=key)
-        return *squash(*self._distribution(output), noise), statistics
+        return *squash(*self._distribution(output[: len(noise)]), noise), statistics
 
 
 def squash(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:

@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from saclab.settings import AlgorithmSettings
+from saclab.settings import AlgorithmSettings, plain_numbers
 
 Scalars = dict[str, Any]
 """Name of a setting -> f32[] or i32[], NumPy or JAX; [R] where runs are mapped over."""
+
+OF_THE_CONTEXT = ("reward_weights",)
+"""Settings that are arguments of the update in its Context."""
 
 
 def scalars(settings: AlgorithmSettings, action_size: int, planned_updates: int | None = None) -> Scalars:
@@ -21,18 +24,13 @@ def scalars(settings: AlgorithmSettings, action_size: int, planned_updates: int 
         planned_updates: the length of the learning rates' schedule; None if they are constant.
     """
     learned = settings.temperature == "learned"
-    target_entropy = -action_size if settings.target_entropy is None else settings.target_entropy
-    return {
-        "discount": np.float32(settings.discount),
-        "critic_learning_rate": np.float32(settings.critic_learning_rate),
-        "actor_learning_rate": np.float32(settings.actor_learning_rate),
-        "temperature_learning_rate": np.float32(settings.temperature_learning_rate if learned else 0),
-        "adam_beta_1": np.float32(settings.adam_beta_1),
-        "adam_beta_2": np.float32(settings.adam_beta_2),
-        "final_learning_rate_share": np.float32(settings.final_learning_rate_share),
-        "planned_updates": np.float32(planned_updates or 1),
-        "polyak_rate": np.float32(settings.polyak_rate),
-        "snapshot_interval": np.int32(settings.snapshot_interval),
-        "initial_temperature": np.float32(settings.initial_temperature),
-        "target_entropy": np.float32(target_entropy),
+    given = {
+        "temperature_learning_rate": settings.temperature_learning_rate if learned else 0.0,
+        "target_entropy": -action_size if settings.target_entropy is None else settings.target_entropy,
+    }
+    numbers = {name: given.get(name, getattr(settings, name)) for name in plain_numbers() if name not in OF_THE_CONTEXT}
+    whole = {name for name in numbers if type(getattr(AlgorithmSettings, name)) is int}
+    kinds = {name: np.int32 if name in whole else np.float32 for name in numbers}
+    return {"planned_updates": np.float32(planned_updates or 1)} | {
+        name: kinds[name](value) for name, value in numbers.items()
     }

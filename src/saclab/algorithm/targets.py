@@ -11,22 +11,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from saclab.algorithm.networks.network import Array
+
 Step = jax.Array | np.int32
-Reduction = Callable[[jax.Array, jax.Array], jax.Array]
+Reduction = Callable[[Array, Array], Array]
 
 
-def minimum(predictions: jax.Array, q: jax.Array) -> jax.Array:
+def minimum(predictions: Array, q: Array) -> Array:
     """The whole prediction of the critic with the smallest Q."""
-    smallest = jnp.argmin(q, axis=0)[None] == jnp.arange(len(q))[:, None]
-    return jnp.sum(jnp.where(smallest[..., None], predictions, 0), axis=0)
+    xp = q.__array_namespace__()
+    smallest = xp.argmin(q, axis=0)[None] == xp.arange(len(q))[:, None]
+    return xp.sum(xp.where(smallest[..., None], predictions, 0), axis=0)
 
 
-def mean(predictions: jax.Array, q: jax.Array) -> jax.Array:
-    return jnp.mean(predictions, axis=0)
+def mean(predictions: Array, q: Array) -> Array:
+    return predictions.__array_namespace__().mean(predictions, axis=0)
+
+
+def reduced_q(reduction: str, q: Array) -> Array:
+    """One Q f32[B] of all critics' f32[C, B]."""
+    one: Array = REDUCTIONS[reduction](q[..., None], q)[:, 0]
+    return one
 
 
 REDUCTIONS: dict[str, Reduction] = {"minimum": minimum, "mean": mean}
-"""Name -> (predictions f32[C, B, n], their Q f32[C, B]) -> f32[B, n]."""
+"""Name -> (predictions f32[C, B, n], their Q f32[C, B]) -> f32[B, n], NumPy or JAX."""
 
 
 def averaged_prediction(

@@ -133,7 +133,8 @@ class DeviceEngine:
     def snapshot(self, run: int) -> Snapshot:
         self.deliver_metrics()
         state = self.runs[run]
-        behaviour = np.asarray(np.array(self.behaviour)[run])
+        late = self.training.acting_delay > 0
+        behaviour = np.asarray(self.behaviour[run]) if late else self.actor(run)
         replay = self.replay.slot(run, state.counters.steps)
         return Snapshot(state, self._learner(run), behaviour, self.pool.observation(run), replay)
 

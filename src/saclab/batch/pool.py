@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import selectors
-import signal
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed, UserError
 from saclab.replay import layout_of
+from saclab.signals import how_it_ended
 from saclab.training import seeds
 from saclab.training.captured import join_arrays, split_arrays
 from saclab.training.engine import EnvironmentStateError
@@ -252,13 +252,12 @@ class PoolWorker:
             yield
         except (EOFError, BrokenPipeError) as error:
             code = self.process.wait()
-            how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
             self.errors.seek(0)
-            last_words = [line for line in self.errors.read().splitlines() if line.strip()][-1:]
+            how = how_it_ended(code, self.errors.read())
             raise EnvironmentWorkerDied(
                 f"the process that steps the environments of runs {sorted(set(self.runs.tolist()))} of the group ended "
-                f"with {how}" + "".join(f": {line}" for line in last_words) + ". Nothing that was saved is lost: start "
-                "the same command again to continue the group from its last checkpoint"
+                f"with {how}. Nothing that was saved is lost: start the same command again to continue the group from "
+                "its last checkpoint"
             ) from error
 
     def close(self) -> None:
@@ -276,4 +275,4 @@ def error_of(entry: dict[str, str], arrays: Arrays) -> RunBroken:
     """The error that a worker has described."""
     if "not_finite" in entry:
         return NonFiniteError(entry["not_finite"], {name.partition(".")[2]: array for name, array in arrays.items()})
-    return RunBroken(f"the environment raised {entry['error']}", arrays, entry["traceback"])
+    return RunBroken(entry["broken"], arrays, entry["traceback"])

@@ -18,7 +18,7 @@ from saclab.batch.frames import Arrays, Message, receive, send
 from saclab.batch.shared_buffers import SharedBuffers, Sizes
 from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
-from saclab.errors import NonFiniteError, UserError
+from saclab.errors import NonFiniteError, RunBroken, UserError
 from saclab.replay import RowLayout
 from saclab.training.captured import join_arrays, split_arrays
 from saclab.training.evaluation import Evaluator
@@ -147,7 +147,11 @@ def described(error: Exception) -> dict[str, str]:
     """What the engine is told of an error in a run's environment."""
     if isinstance(error, NonFiniteError):
         return {"not_finite": str(error)}
-    return {"error": f"{type(error).__name__}: {error}", "traceback": "".join(traceback.format_exception(error))}
+    known = isinstance(error, RunBroken | UserError)
+    return {
+        "broken": str(error) if known else f"{type(error).__name__}: {error}",
+        "traceback": error.traceback if isinstance(error, RunBroken) else "".join(traceback.format_exception(error)),
+    }
 
 
 def main() -> None:

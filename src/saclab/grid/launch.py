@@ -11,7 +11,7 @@ from pathlib import Path
 from saclab.grid.plan import Cell
 from saclab.grid.pool import End, WorkerPool
 from saclab.grid.tasks import RunStatus, Task, make_statuses, make_tasks
-from saclab.grid.worker_process import how_it_ended
+from saclab.signals import how_it_ended
 from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.requests import Requests
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from saclab.grid.groups import run_groups
 from saclab.grid.plan import Cell
 from saclab.grid.rate import RateMeter
-from saclab.grid.worker_process import how_it_ended
+from saclab.signals import how_it_ended
 
 Status = Literal["waiting", "running", "finished", "interrupted", "failed"]
 

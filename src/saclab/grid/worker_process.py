@@ -99,18 +99,6 @@ class WorkerProcess:
         self.process.wait()
 
 
-def how_it_ended(code: int, errors: str) -> str:
-    """The end of a worker in words, with its last ones.
-
-    Args:
-        code: its exit status, below 0 for a signal.
-        errors: what it has written to its standard error.
-    """
-    how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
-    last_words = [line.strip() for line in errors.splitlines() if line.strip()][-1:]
-    return ": ".join([how, *last_words])
-
-
 def die_with(launcher: int) -> None:
     """Have this process killed at the moment in which its launcher dies.
 

@@ -9,7 +9,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from saclab.config import Config
+from saclab.environments.checked import checked_reset, checked_step
 from saclab.environments.make import EnvironmentSpec, environment_spec, make_environment
+from saclab.environments.reward_terms import split_reward
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken
 from saclab.replay import RowLayout
@@ -127,7 +129,12 @@ def spec_of(config: Config) -> EnvironmentSpec:
     """What a learner must know of a run's environment; raises UserError if it cannot be trained on."""
     environment = make_environment(config.environment, config.environment_arguments)
     try:
-        return environment_spec(config.environment, environment)
+        spec = environment_spec(config.environment, environment)
+        if names := config.algorithm.reward_terms:
+            checked_reset(environment, spec.observation_size, seed=0)
+            step = checked_step(environment, spec.scale_action(np.zeros(spec.action_size)), spec.observation_size)
+            split_reward(config.environment, step.reward, step.info, names)
+        return spec
     finally:
         environment.close()
 

@@ -79,6 +79,8 @@ class Failed(NamedTuple):
     """A run met a number that is not finite, or its environment broke; the others of its run group go on."""
 
     message: str
+    not_finite: bool = True
+    """Whether it is about a number that is not finite."""
 
 
 class Interrupted(NamedTuple):

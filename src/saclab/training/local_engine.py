@@ -10,7 +10,7 @@ import numpy as np
 from saclab.algorithm.types import Context
 from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
-from saclab.errors import NonFiniteError, RunBroken
+from saclab.errors import RunBroken
 from saclab.replay import ReplayBuffer, layout_of, require_memory
 from saclab.settings import structure
 from saclab.training import seeds
@@ -82,7 +82,7 @@ class LocalEngine:
         run, counters = self.run, self.run.counters
         try:
             transitions, ended = self.environments.step(self._next_action())
-        except NonFiniteError as error:
+        except RunBroken as error:
             return StepResult({}, {0: Broken(error, self.snapshot(0))})
         self.replay.add(transitions)
         if run.reward_scale.active:
@@ -142,7 +142,7 @@ class LocalEngine:
 
         try:
             return {0: self.evaluator.run(act, self.run.evaluation_seeds())}
-        except NonFiniteError as error:
+        except RunBroken as error:
             return {0: error}
 
     def measure_q_bias(self, runs: Sequence[int]) -> Mapping[int, QBias | RunBroken]:

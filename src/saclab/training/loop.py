@@ -48,7 +48,7 @@ def train(
     with closing(train_runs(LocalBuilder(config), [folder], requests, checkpoint_minutes)) as told:
         for _, event in told:
             if isinstance(event, Failed):
-                raise NonFiniteError(event.message)
+                raise (NonFiniteError if event.not_finite else RunBroken)(event.message)
             yield event
 
 
@@ -177,7 +177,7 @@ class Session:
             error = first
         message = f"{error}. {write_failure_report(self.writers[run].folder, snapshot, error)}"
         self._drop(run)
-        return run, Failed(message)
+        return run, Failed(message, isinstance(error, NonFiniteError))
 
     def _drop(self, run: int) -> None:
         self.active.remove(run)

@@ -17,12 +17,12 @@ import numpy as np
 from saclab.algorithm.learner import Learner
 from saclab.algorithm.networks.network import Array
 from saclab.algorithm.policy import Policy
+from saclab.algorithm.targets import reduced_q
 from saclab.config import Config
 from saclab.environments.checked import checked_reset, checked_step
 from saclab.environments.make import EnvironmentSpec
 from saclab.training import seeds
 
-REDUCTIONS: dict[str, Callable[..., np.ndarray]] = {"minimum": np.min, "mean": np.mean}
 NEGLIGIBLE = 0.01  # weight γ^n below which what follows a cut-off state is left out
 
 
@@ -44,8 +44,8 @@ class Critics(NamedTuple):
     def q(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
         """What the policy is trained to raise: f32[n] for f32[n, O] and f32[n, A]."""
         inputs = np.concatenate([observation, action], axis=1)
-        each = [self.q_values(row, inputs) for row in self.critic]
-        reduced: np.ndarray = REDUCTIONS[self.reduction](each, axis=0)
+        each = np.stack([self.q_values(row, inputs) for row in self.critic])
+        reduced: np.ndarray = reduced_q(self.reduction, each)
         return reduced
 
 

@@ -6,6 +6,9 @@ stored transition has today's scale.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import numpy as np
 
 from saclab.training.captured import require_like
@@ -13,6 +16,13 @@ from saclab.training.checkpoint import Arrays
 
 EPSILON = 1e-8
 FIRST_COUNT = 1e-4  # of the start's variance of 1
+
+SCALES: dict[str, Callable[[float, float], float]] = {
+    "none": lambda variance, largest: 1.0,
+    "deviation": lambda variance, largest: math.sqrt(variance) + EPSILON,
+    "deviation_or_bound": lambda variance, largest: max(math.sqrt(variance + EPSILON), largest),
+}
+"""Name -> (variance of the return, its largest value over the critics' bound) -> the scale."""
 
 
 class RewardScale:
@@ -58,12 +68,7 @@ class RewardScale:
     @property
     def value(self) -> np.float32:
         """What rewards are divided by now."""
-        if not self.active:
-            return np.float32(1)
-        variance = self.moments[2]
-        if self.kind == "deviation":
-            return np.float32(np.sqrt(variance) + EPSILON)
-        return np.float32(max(np.sqrt(variance + EPSILON), self.largest[0] / self.bound))
+        return np.float32(SCALES[self.kind](self.moments[2], self.largest[0] / self.bound))
 
     def capture(self) -> Arrays:
         """Empty if nothing is scaled."""

@@ -108,4 +108,6 @@ def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -
     restore_generator("sampling", run.sampling, state.get("sampling"))
     like = np.zeros((config.training.parallel_environments, layout.observation_size), np.float32)
     environments = join_arrays(groups.get("environments", {}), part(state, "environments", list), like)
-    return Start(run, learner, behaviour, environments)
+    start = Start(run, learner, behaviour, environments)
+    run.reward_scale.returns[start.restarting] = 0.0
+    return start

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, split, unit_columns
+from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, project_kernels, split
 
 MOMENTUM = 0.99
 EPSILON = 1e-3
@@ -70,7 +70,10 @@ def batch_norm_mlp(
 ) -> Network:
     """Kernels start orthogonal (gain √2, that of the last layer 1), biases at 0, scales at 1."""
     shape = Shape((inputs, *hidden_layers, outputs), activation)
-    project = partial(project_kernels, shape) if projection == "unit_columns" else lambda vector: vector
+
+    def project(vector: jax.Array) -> jax.Array:
+        return project_kernels(vector, shape.packed, dict(enumerate(shape.kernels)), projection)
+
     return Network(
         init=lambda key: project(initial(shape, key)),
         apply=partial(apply, shape),
@@ -126,11 +129,3 @@ def normalise(x: Array, mean: Array, variance: Array, scale: Array, bias: Array)
     """(x − mean) / √(variance + ε) · scale + bias, by the last axis."""
     xp: Any = x.__array_namespace__()
     return (x - mean) / xp.sqrt(variance + EPSILON) * scale + bias
-
-
-def project_kernels(shape: Shape, vector: jax.Array) -> jax.Array:
-    """The vector f32[P] with unit columns in each kernel."""
-    parts = split(vector, shape.packed)
-    for number, kernel in enumerate(shape.kernels):
-        parts[number] = unit_columns(parts[number].reshape(kernel)).ravel()
-    return jnp.concatenate(parts)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, product, split, unit_columns
+from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, product, project_kernels, split
 
 
 def mlp(
@@ -37,11 +37,7 @@ def mlp(
         return apply(vector, *inputs), jnp.zeros(0, vector.dtype)
 
     def project(vector: jax.Array) -> jax.Array:
-        if projection == "none":
-            return vector
-        parts = split(vector, sizes)
-        for number, shape in enumerate(layers):
-            parts[2 * number] = unit_columns(parts[2 * number].reshape(shape)).ravel()
-        return jnp.concatenate(parts)
+        kernels = {2 * number: shape for number, shape in enumerate(layers)}
+        return project_kernels(vector, sizes, kernels, projection)
 
     return Network(init, apply, train, project, sum(sizes))

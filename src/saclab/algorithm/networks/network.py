@@ -91,6 +91,32 @@ def split(vector: Array, sizes: tuple[int, ...]) -> list[Array]:
     return parts
 
 
+def project_kernels(
+    vector: jax.Array, sizes: tuple[int, ...], kernels: dict[int, tuple[int, int]], projection: str
+) -> jax.Array:
+    """A packed vector with each of its kernels projected.
+
+    Args:
+        vector: f32[P].
+        sizes: of its parts.
+        kernels: number of a part -> its shape, for those that are kernels.
+        projection: a key of PROJECTIONS.
+    """
+    if projection == "none":
+        return vector
+    parts = split(vector, sizes)
+    for number, shape in kernels.items():
+        parts[number] = PROJECTIONS[projection](parts[number].reshape(shape)).ravel()
+    return jnp.concatenate(parts)
+
+
 def unit_columns(weights: jax.Array) -> jax.Array:
     """f32[I, O] with the weights into each unit scaled to length 1."""
     return weights / jnp.maximum(jnp.linalg.norm(weights, axis=0, keepdims=True), 1e-8)
+
+
+PROJECTIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "none": lambda weights: weights,
+    "unit_columns": unit_columns,
+}
+"""Name -> what is done to each kernel f32[I, O] after a step."""

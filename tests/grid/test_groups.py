@@ -18,6 +18,7 @@ from saclab.grid.local import local_pool
 from saclab.grid.plan import Cell, make_grid
 from saclab.training.requests import Requests
 from saclab.training.run_folder import read_last_session, read_run
+from saclab.variants import VARIANTS, Variant
 
 SETTINGS = {
     "hidden_layers": (8,), "batch_size": 16, "random_steps": 100, "max_updates": 300, "update_interval": 1,
@@ -174,6 +175,16 @@ def test_a_grid_begun_alone_goes_on_in_run_groups(tmp_path):
 def test_the_delay_of_a_run_group_is_the_users_choice(tmp_path):
     (cell,) = grid(tmp_path, seeds=1, acting_delay=1)[:1]
     assert "one round of updates behind (acting_delay 1)" in resources.group_note([cell], 4)
+
+
+def test_what_differs_between_variants_is_said_of_each(tmp_path, monkeypatch):
+    monkeypatch.setitem(VARIANTS, "redq", Variant("REDQ", "", {"updates_per_interval": 20, "acting_delay": 1}))
+    cells = make_grid(["Pendulum-v1"], ["sac", "redq", "averaged"], "quick", 1, tmp_path)
+    note = resources.group_note(cells, 4)
+    assert "; sac, averaged: the environments wait for the updates (" in note
+    assert "; redq: the policy that acts is one round of updates behind (acting_delay 1); " in note
+    assert "; sac, averaged: 1 update(s) per 2 environment step(s): update-to-data ratio 0.5; " in note
+    assert note.endswith("; redq: 20 update(s) per 2 environment step(s): update-to-data ratio 10")
 
 
 @pytest.mark.parametrize("present", [True, False])

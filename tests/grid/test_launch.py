@@ -5,19 +5,22 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from saclab.errors import UserError
+from saclab import replay
+from saclab.errors import SettingError, UserError
 from saclab.grid.launch import launch
 from saclab.grid.local import core_groups, local_pool
-from saclab.grid.plan import Cell, make_grid, seed_numbers
+from saclab.grid.plan import Cell, make_grid, require_startable, seed_numbers
 from saclab.grid.rate import RateMeter
 from saclab.grid.tasks import RunStatus
 from saclab.machine import usable_cores
 from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished
+from saclab.variants import VARIANTS, Variant
 
 SETTINGS = {
     "hidden_layers": (8,), "batch_size": 16, "random_steps": 100, "max_updates": 200, "update_interval": 1,
@@ -37,6 +40,29 @@ def test_a_grid_goes_seed_by_seed_and_has_no_cell_twice(tmp_path: Path) -> None:
         for seed in (3, 4) for environment in ("A-v0", "B-v0") for variant in ("sac", "averaged")
     ]  # fmt: skip
     assert len({cell.folder for cell in cells}) == len(cells)
+
+
+@pytest.mark.parametrize("order", [("sac", "large"), ("large", "sac")])
+@pytest.mark.parametrize("row", [{"replay_capacity": 200_000}, {"reward_terms": tuple("abcdefghijkl")}])
+def test_memory_must_do_for_the_largest_replay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, order: tuple[str, ...], row: dict[str, Any]
+) -> None:
+    """On Pendulum-v1 a row has 9 numbers: 100,000 of them take 3.6 MB, the larger buffers twice as much."""
+    monkeypatch.setitem(VARIANTS, "large", Variant("Large", "", row))
+    monkeypatch.setattr(replay, "available_memory", lambda: 10**7)
+    require_startable(make_grid(["Pendulum-v1"], ["sac", "sac-auto"], "quick", 1, tmp_path), 2, "--workers")
+    cells = make_grid(["Pendulum-v1"], order, "quick", 1, tmp_path)
+    with pytest.raises(SettingError, match="in each of 2 runs at once"):
+        require_startable(cells, 2, "--workers")
+    require_startable(cells, 0, "--workers")
+
+
+def test_arguments_of_every_environment_are_tried(tmp_path: Path) -> None:
+    """Cells of one environment with other arguments are other environments."""
+    cells = [cell for arguments in ({}, {"no_such": 1})
+             for cell in make_grid(["Pendulum-v1"], ["sac"], "quick", 1, tmp_path, arguments)]  # fmt: skip
+    with pytest.raises(UserError, match="no_such"):
+        require_startable(cells, 0, "--workers")
 
 
 def test_a_status_takes_in_what_a_worker_says(tmp_path: Path) -> None:

@@ -31,12 +31,16 @@ def write_run(
     level: float = 8000.0,
     finished: bool = True,
     metrics: tuple[str, ...] = METRICS,
+    constants: dict[str, float] | None = None,
     rename: dict[str, Any] | None = None,
     name: str | None = None,
     returns: list[float] | None = None,
     q_bias: bool = False,
 ) -> Path:
-    """Write one run and return its folder; `returns` are the evaluation returns, else a noisy rise to about `level`."""
+    """Write one run and return its folder; `returns` are the evaluation returns, else a noisy rise to about `level`.
+
+    `constants` are metrics that keep one value.
+    """
     config = make_config(environment, variant, protocol, seed, overrides=overrides)
     folder = run_path(root, config, name)
     folder.mkdir(parents=True)
@@ -53,7 +57,7 @@ def write_run(
     curve = curve + generator.normal(0, 0.03 * abs(level), curve.shape) + generator.normal(0, 0.05 * abs(level))
     write_evaluations(folder, generator, curve, count, returns)
     write_episodes(folder, curve, 10 * count)
-    write_metrics(folder, generator, curve, 10 * count, metrics)
+    write_metrics(folder, generator, curve, 10 * count, metrics, constants or {})
     write_q_bias(folder, count if q_bias else 0)
     if finished:
         (folder / "result.json").write_text(json.dumps({"reason": "max_updates"}))
@@ -93,10 +97,12 @@ def write_q_bias(folder: Path, count: int) -> None:
             })  # fmt: skip
 
 
-def write_metrics(folder: Path, generator: Any, curve: np.ndarray, count: int, names: tuple[str, ...]) -> None:
+def write_metrics(
+    folder: Path, generator: Any, curve: np.ndarray, count: int, names: tuple[str, ...], constants: dict[str, float]
+) -> None:
     with (folder / "metrics.jsonl").open("w") as file:
         for window in range(1, count + 1):
-            values = {name: float(generator.normal(1, 0.1)) for name in names}
+            values = {name: float(generator.normal(1, 0.1)) for name in names} | constants
             if "actor_loss" in names:
                 values["actor_loss"] = -curve[window] / 10
             file.write(json.dumps({"updates": 200 * window, "steps": 1000 * window, **values, "seconds": 2.0 * window}))

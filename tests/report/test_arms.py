@@ -113,6 +113,22 @@ def test_training_settings_of_a_variants_row_are_its_own(tmp_path, monkeypatch):
         read_comparison([write_run(tmp_path / "a", "sac"), write_run(tmp_path / "a", "sac", 1), slower])
 
 
+def test_a_row_set_back_to_the_protocol_is_no_plain_run(tmp_path, monkeypatch):
+    """Where the user sets what the row changes to the protocol's value, the run is trained in another way."""
+    monkeypatch.setitem(VARIANTS, "fast", Variant("Fast", "", {"updates_per_interval": 20}))
+    fast, sac = write_run(tmp_path, "fast"), write_run(tmp_path, "sac")
+    back = write_run(tmp_path, "fast", 1, overrides={"updates_per_interval": 1})
+    with pytest.raises(UserError, match=r"update-to-data ratio is (0.2|4.0) in .* and (0.2|4.0) in"):
+        read_comparison([fast, back])
+    with pytest.raises(UserError, match=r"updates_per_interval is 1 in .*fast.* and the variant's own 1 in .*sac"):
+        read_comparison([sac, back, write_run(tmp_path, "sac", 1)])
+    arms = read_comparison([fast, back], allow_mixed=True).arms
+    assert len(arms) == 2, "they are not averaged"
+    given = {"update_interval": 2}
+    both = [write_run(tmp_path / "given", variant, overrides=given) for variant in ("sac", "fast")]
+    assert len(read_comparison(both).arms) == 2, "what all have been given leaves the row its own"
+
+
 @pytest.fixture(scope="module")
 def seven(tmp_path_factory):
     """Seven arms with five seeds each, two of them under names of their own, on the path of the averaging study."""

@@ -3,11 +3,14 @@
 import csv
 import json
 import shlex
+import subprocess
+import sys
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import pytest
 
+from saclab.algorithm.metrics import METRICS
 from saclab.errors import UserError
 from saclab.protocols import make_config
 from saclab.report import figures
@@ -126,9 +129,12 @@ def test_script_data_covers_every_run_and_panel(report):
     _, page = report
     data = page.data
     assert [environment["name"] for environment in data["environments"]] == ["HalfCheetah-v4", "Humanoid-v4"]
-    assert [len(environment["panels"]) for environment in data["environments"]] == [9, 11]
-    assert [panel["title"] for panel in data["environments"][1]["panels"][-2:]] == ["Q bias", "Q bias, spread"]
-    assert data["environments"][1]["panels"][-2]["arms"][0]["middle"][:2] == [0.5, 0.25]
+    titles = [[panel["title"] for panel in environment["panels"]] for environment in data["environments"]]
+    known = ["temperature α", "policy entropy", "mean Q", "Q spread", "snapshot spread"]
+    others = ["critic_loss", "temperature_loss", "target_mean"]
+    assert titles[0][4:] == [*known, *others]
+    assert titles[1][4:] == [*known, "Q bias", "Q bias, spread", *others]
+    assert data["environments"][1]["panels"][titles[1].index("Q bias")]["arms"][0]["middle"][:2] == [0.5, 0.25]
     for environment in data["environments"]:
         for panel in environment["panels"]:
             assert [len(arm["runs"]) for arm in panel["arms"]] == [2, 2, 2]
@@ -243,6 +249,30 @@ def test_short_runs_and_missing_metrics_work(tmp_path, options):
     assert not list((tmp_path / "out" / "figures").glob("improvement-*"))
     if not options.get("finished", True):
         assert "2 of 2 runs unfinished" in page.words
+
+
+def test_diagnostics_are_what_the_runs_have(tmp_path):
+    """Known metrics by title, others by name; what no run has, or what is 0 in all, has no panel."""
+    names = ("actor_loss", "temperature", "temperature_loss", "snapshot_spread", "reward_scale", "my_<metric>")
+    zero = {"temperature_loss": 0.0, "snapshot_spread": 0.0}
+    runs = [write_run(tmp_path, "sac", metrics=names, constants=zero),
+            write_run(tmp_path, "averaged", metrics=names, constants={"temperature_loss": 0.0})]  # fmt: skip
+    page = Page(write_report(runs, tmp_path / "out").read_text())
+    (environment,) = page.data["environments"]
+    panels = {panel["title"]: panel for panel in environment["panels"] if panel["group"] == "diagnostics"}
+    assert list(panels) == ["temperature α", "snapshot spread", "reward_scale", "my_<metric>"]
+    assert panels["reward_scale"]["meaning"] == METRICS["reward_scale"] != panels["my_<metric>"]["meaning"] == ""
+    assert [len(arm["runs"]) for arm in panels["snapshot spread"]["arms"]] == [1, 1], "it is not 0 in all"
+    drawn = (tmp_path / "out" / "figures" / "diagnostics-HalfCheetah-v4.svg").read_text()
+    assert "reward_scale" in drawn
+    assert "temperature_loss" not in drawn
+    alone = Page(write_report(runs[:1], tmp_path / "alone").read_text())
+    assert "snapshot spread" not in {panel["title"] for panel in alone.data["environments"][0]["panels"]}
+
+
+def test_a_report_is_imported_without_jax():
+    code = "import sys, saclab.report.report; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_run_without_any_log_works(tmp_path):

@@ -7,6 +7,7 @@ from saclab.report.notices import all_notices, notices, scale_notice
 from saclab.report.runs import read_comparison
 from saclab.report.text import shown
 from saclab.training.run_folder import read_run
+from saclab.variants import VARIANTS, Variant
 
 from .synthetic import write_run
 
@@ -110,6 +111,23 @@ def test_no_run_folder_and_no_run(tmp_path):
 )
 def test_scaled_down_runs_are_noticed(tmp_path, options, said):
     notice = scale_notice(read_run(write_run(tmp_path, **options)))
+    assert notice is None if said is None else said in notice
+
+
+@pytest.mark.parametrize(
+    ("row", "options", "said"),
+    [
+        ({"max_updates": 300_000}, {}, None),
+        ({"max_updates": 300_000}, {"overrides": SHORT}, "60,000 of 300,000 updates of the paper protocol"),
+        ({"updates_per_interval": 20}, {"protocol": "standard"}, None),
+        ({"updates_per_interval": 20}, {"protocol": "standard", "overrides": {"max_steps": 110_000}},
+         "2,000,000 of 19,800,000 updates"),
+        ({"max_episodes": 500}, {}, None),
+    ],
+)  # fmt: skip
+def test_what_is_full_for_a_variant_its_row_says(tmp_path, monkeypatch, row, options, said):
+    monkeypatch.setitem(VARIANTS, "redq", Variant("REDQ", "", row))
+    notice = scale_notice(read_run(write_run(tmp_path, "redq", **options)))
     assert notice is None if said is None else said in notice
 
 

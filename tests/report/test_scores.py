@@ -9,6 +9,7 @@ from saclab.report.runs import read_comparison
 from saclab.report.scores import aggregate, common_horizon, score_environment
 from saclab.report.sentences import MORE_SEEDS, ONE_SEED, environment_sentences
 from saclab.report.text import number_text
+from saclab.variants import VARIANTS, Variant
 
 from .synthetic import write_run
 
@@ -81,6 +82,26 @@ def test_different_budgets_are_cut_to_the_shortest(tmp_path):
         write_run(tmp_path, "averaged", 0, returns=[5.0] * 2, overrides={"max_updates": 4000}),
     ]
     assert common_horizon(read_comparison(folders, allow_mixed=True).runs) == 20_000
+
+
+@pytest.mark.parametrize("row", [{"updates_per_interval": 20}, {"random_steps": 5_000}, {"update_interval": 1}])
+def test_equal_updates_of_unequal_ratios_are_unequal_budgets(tmp_path, monkeypatch, row):
+    """1.2e6 updates at 1:5 are 6e6 steps, at 20:5 3e5: a run that went further is cut where the other ended."""
+    monkeypatch.setitem(VARIANTS, "redq", Variant("REDQ", "", row))
+    folders = [
+        write_run(tmp_path, "sac", 0, returns=[1.0, 2.0, 3.0, 4.0]),
+        write_run(tmp_path, "redq", 0, returns=[5.0, 6.0]),
+    ]
+    entry = scores_of(folders)
+    assert entry.horizon == 20_000
+    assert [arm.runs[0].best for arm in entry.arms] == [2.0, 6.0]
+
+
+def test_equal_steps_of_unequal_ratios_cut_nobody(tmp_path, monkeypatch):
+    monkeypatch.setitem(VARIANTS, "redq", Variant("REDQ", "", {"updates_per_interval": 20}))
+    folders = [write_run(tmp_path, variant, protocol="standard", returns=[1.0] * count)
+               for variant, count in (("sac", 4), ("redq", 2))]  # fmt: skip
+    assert common_horizon(read_comparison(folders).runs) is None
 
 
 def test_without_evaluations_there_is_nothing_to_compare(tmp_path):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from saclab.algorithm.heads import HEADS, CriticHead
 from saclab.algorithm.losses import actor_loss, temperature_loss
+from saclab.algorithm.metrics import METRICS
 from saclab.algorithm.networks import NETWORKS
 from saclab.algorithm.networks.network import Array, Network
 from saclab.algorithm.optimizer import Trainer, descend
@@ -19,20 +20,6 @@ from saclab.algorithm.scalars import Scalars
 from saclab.algorithm.targets import REDUCTIONS, averaged_entropy, averaged_prediction, polyak_update, reduced_q
 from saclab.algorithm.types import Batch, Context, LearnerState
 from saclab.settings import AlgorithmSettings
-
-METRICS = {
-    "critic_loss": "The loss of the critics' head (Eq. 3), summed over the critics.",
-    "actor_loss": "Eq. 5: the paper's policy loss.",
-    "temperature_loss": "Eq. 8; 0 if the temperature is fixed.",
-    "temperature": "α as this update found it.",
-    "entropy": "Mean of −log π over the batch, in nats, for actions in [-1, 1].",
-    "q_mean": "Mean of the critics on the batch's actions.",
-    "q_spread": "Mean over the batch of the standard deviation between critics.",
-    "target_mean": "Mean of the critics' regression target.",
-    "snapshot_spread": "Mean over the batch of the standard deviation between the K snapshots' values; 0 for K = 1.",
-    "reward_scale": "What rewards were divided by.",
-}
-"""What an update may report: name -> meaning."""
 
 
 def metric_names(settings: AlgorithmSettings) -> tuple[str, ...]:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from saclab.config import Config
 from saclab.protocols import make_config, protocol_row
 from saclab.settings import require
 from saclab.training.run_folder import is_finished, run_path
+
+if TYPE_CHECKING:
+    from saclab.environments.make import EnvironmentSpec
+    from saclab.replay import RowLayout
 
 
 class Cell(NamedTuple):
@@ -85,25 +90,31 @@ def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 
 def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
     """Raise UserError before anything is started if an environment, a folder or the memory will not do.
 
+    The runs of one environment need not have replay buffers of one size: a variant's row may say another capacity or
+    other reward terms. The memory must do for the largest in all that are filled at once.
+
     Args:
         cells: the grid.
         at_once: runs whose replay buffers this machine's memory must hold together; 0 if they lie elsewhere.
         fewer: the option that would lower their number.
     """
     from saclab.environments.make import environment_spec, make_environment
-    from saclab.replay import layout_of, require_memory
+    from saclab.replay import layout_of, replay_bytes, require_memory
     from saclab.training.starts import require_same_config
 
-    checked = set()
+    specs: dict[tuple[str, str], EnvironmentSpec] = {}
+    buffers: dict[int, tuple[int, RowLayout]] = {}
     for cell in cells:
+        config = cell.config
         if (cell.folder / "config.json").exists():
-            require_same_config(cell.folder, cell.config)
-        if cell.config.environment in checked:
-            continue
-        checked.add(cell.config.environment)
-        environment = make_environment(cell.config.environment, cell.config.environment_arguments)
-        spec = environment_spec(cell.config.environment, environment)
-        environment.close()
-        if at_once:
-            layout = layout_of(spec, cell.config.algorithm)
-            require_memory(cell.config.training.replay_capacity, layout, at_once, fewer)
+            require_same_config(cell.folder, config)
+        key = config.environment, json.dumps(config.environment_arguments, sort_keys=True, default=repr)
+        if key not in specs:
+            environment = make_environment(config.environment, config.environment_arguments)
+            specs[key] = environment_spec(config.environment, environment)
+            environment.close()
+        layout = layout_of(specs[key], config.algorithm)
+        buffer = config.training.replay_capacity, layout
+        buffers[replay_bytes(*buffer)] = buffer
+    if at_once:
+        require_memory(*buffers[max(buffers)], at_once, fewer)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import NamedTuple
 
+from saclab.config import Config
 from saclab.grid.cluster import Cluster, chosen_cluster
 from saclab.grid.groups import run_groups
 from saclab.grid.local import local_pool
@@ -95,8 +96,21 @@ def group_note(cells: Sequence[Cell], batch: int) -> str:
 
     groups = run_groups([cell for cell in cells if not cell.finished], batch)
     sizes = ", ".join(str(len(group.members)) for group in groups) or "none to do"
-    if cells[0].config.training.acting_delay:
-        acting = "the policy that acts is one round of updates behind (acting_delay 1)"
-    else:
-        acting = "the environments wait for the updates (--acting-delay 1 is faster: it steps them meanwhile)"
-    return f"run groups of {sizes} run(s), each with the machine to itself; {acting}; {ratio_note(cells[0].config)}"
+    machine = f"run groups of {sizes} run(s), each with the machine to itself"
+    return "; ".join([machine, *(by_variant(cells, say) for say in (acting_note, ratio_note))])
+
+
+def acting_note(config: Config) -> str:
+    if config.training.acting_delay:
+        return "the policy that acts is one round of updates behind (acting_delay 1)"
+    return "the environments wait for the updates (--acting-delay 1 is faster: it steps them meanwhile)"
+
+
+def by_variant(cells: Sequence[Cell], say: Callable[[Config], str]) -> str:
+    """What is to be said of the runs: once if it is the same of all, else each with the variants that it is true of."""
+    said: dict[str, dict[str, None]] = {}
+    for cell in cells:
+        said.setdefault(say(cell.config), {})[cell.config.variant] = None
+    if len(said) == 1:
+        return next(iter(said))
+    return "; ".join(f"{', '.join(variants)}: {text}" for text, variants in said.items())

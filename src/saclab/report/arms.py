@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple
 
 from saclab.config import Config
 from saclab.errors import UserError
-from saclab.protocols import PROTOCOLS, make_config, training_settings
+from saclab.protocols import PROTOCOLS, make_config, protocol_settings, split_settings
 from saclab.report.text import shown
 from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord, safe_name
@@ -21,6 +20,11 @@ SIMULATION_PACKAGES = ("gymnasium", "mujoco")
 
 ONLY_MEASURING = ("q_bias_episodes",)
 """Settings that change what is measured beside the training, and not its course."""
+
+RATIO_SETTINGS = ("updates_per_interval", "update_interval")
+OWN = "the variant's own"
+"""Stands for a value that no one has changed: variants are comparable though their rows say different ones. A value
+that was set is never equal to it, not even where another variant has that value."""
 
 
 class Arm(NamedTuple):
@@ -89,26 +93,27 @@ def own_name(run: RunRecord) -> str | None:
 
 def conditions(run: RunRecord) -> dict[str, Any]:
     """What must be equal for all runs of one environment: protocol, training and simulator."""
-    training = beside_own_training(run.config)
     versions = {f"{package} version": major(run.versions.get(package)) for package in SIMULATION_PACKAGES}
+    training, own = asdict(run.config.training), own_training(run.config)
+    unchanged = {} if own is None else asdict(own)
     return {
         "protocol": run.config.protocol,
-        "update-to-data ratio": training.update_to_data_ratio,
         **versions,
         "environment_arguments": run.config.environment_arguments,
-        **{name: value for name, value in asdict(training).items() if name not in ONLY_MEASURING},
-    }
+        **{name: OWN if name in unchanged and value == unchanged[name] else value
+           for name, value in training.items() if name not in ONLY_MEASURING},
+    }  # fmt: skip
 
 
-def beside_own_training(config: Config) -> TrainingSettings:
-    """How a run is trained, but for what its variant's row says of it: there the protocol's values stand."""
+def own_training(config: Config) -> TrainingSettings | None:
+    """How a run is trained if no one changes it: by its protocol, and by what its variant's row says for itself.
+
+    By the protocol alone for a variant that this version does not know; None for such a protocol.
+    """
+    if config.protocol not in PROTOCOLS:
+        return None
     row = VARIANTS[config.variant].settings if config.variant in VARIANTS else {}
-    values = asdict(config.training)
-    own = [name for name, value in row.items() if name in values and values[name] == value]
-    if not own or config.protocol not in PROTOCOLS:
-        return config.training
-    protocol = asdict(training_settings(config.protocol, config.environment))
-    return dataclasses.replace(config.training, **{name: protocol[name] for name in own})
+    return TrainingSettings(**split_settings(protocol_settings(config.protocol, config.environment) | row)[1])
 
 
 def beside_variant(config: Config) -> dict[str, Any]:
@@ -141,15 +146,28 @@ def unlike(run: RunRecord, reference: RunRecord) -> dict[str, tuple[Any, Any]]:
     here, there = conditions(run), conditions(reference)
     if own_name(run) is None:
         here, there = here | beside_variant(run.config), there | beside_variant(reference.config)
-    own_here, own_there = asdict(run.config.algorithm), asdict(reference.config.algorithm)
-    return {
-        name: (
-            here[name] if name in here else f"the variant's own {own_here[name]}",
-            there[name] if name in there else f"the variant's own {own_there[name]}",
-        )
+    found = {
+        name: (value_shown(name, run, here, reference), value_shown(name, reference, there, run))
         for name in here | there
         if name not in here or name not in there or here[name] != there[name]
     }
+    ratios = run.config.training.update_to_data_ratio, reference.config.training.update_to_data_ratio
+    if found.keys() & RATIO_SETTINGS and ratios[0] != ratios[1]:  # it says more than the settings it follows from
+        found = {"update-to-data ratio": ratios, **found}
+    return found
+
+
+def value_shown(name: str, run: RunRecord, values: Mapping[str, Any], other: RunRecord) -> Any:
+    """A value that makes a run not comparable with another.
+
+    It says so if no one has changed it, but for the protocol's values of a training: these differ plainly enough.
+    """
+    if name in values and values[name] != OWN:
+        return values[name]
+    value, others = (asdict(each.config.algorithm) | asdict(each.config.training) for each in (run, other))
+    row = VARIANTS[run.config.variant].settings if run.config.variant in VARIANTS else {}
+    protocols = name in values and name not in row
+    return value[name] if protocols and value[name] != others[name] else f"{OWN} {value[name]}"
 
 
 def unlike_in_arm(run: RunRecord, first: RunRecord) -> dict[str, tuple[Any, Any]]:

@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from saclab.algorithm.metrics import METRICS
 from saclab.report.arms import Arm
 from saclab.report.runs import Comparison
 from saclab.report.statistics import bootstrap_band
+from saclab.report.text import shown
 from saclab.training.run_folder import RunRecord
 
 AXES = {
@@ -58,7 +60,10 @@ DIAGNOSTICS = (
     Quantity("q_bias_spread", "Q bias, spread", "q_bias", "bias_spread", "updates",
              "standard deviation of the Q bias over states"),
 )  # fmt: skip
+"""What has a title of its own; whatever else a variant reports comes behind it under its name."""
 
+COUNTERS = ("updates", "steps", "episodes", "seconds")
+"""Columns of metrics.jsonl that are no metric."""
 
 POINTS = 200
 """At most so many points per curve: beyond it one sees only noise."""
@@ -95,32 +100,50 @@ class ArmCurves(NamedTuple):
     band: SeedBand
 
 
-Curves = dict[tuple[str, Arm, str], ArmCurves]
-"""(environment, arm, key of a quantity) -> curves; missing where nothing was logged."""
+Curves = dict[tuple[str, Arm, Quantity], ArmCurves]
+"""(environment, arm, quantity) -> curves; missing where nothing was logged."""
 
 
 def gather_curves(comparison: Comparison) -> Curves:
-    """All quantities of all runs, thinned to what a figure can show; rows of equal runs stay aligned."""
+    """All quantities of all runs, thinned to what a figure can show; rows of equal runs stay aligned.
+
+    A diagnostic that is 0 throughout an environment is none: the loss of a temperature that is fixed, the spread of a
+    single snapshot.
+    """
     points = max(20, min(POINTS, ALL_POINTS // len(comparison.runs)))
     gathered: Curves = {}
     for environment in comparison.environments:
-        for quantity in PAPER_PANELS + DIAGNOSTICS:
+        others = other_metrics(comparison.runs_of(environment))
+        for quantity in PAPER_PANELS + DIAGNOSTICS + others:
             whole = {(arm, run.config.seed): curve
                      for arm in comparison.arms_of(environment)
                      for run in comparison.groups[environment, arm]
                      if (curve := series(run, quantity))}  # fmt: skip
+            if quantity not in PAPER_PANELS and not any(curve.y.any() for curve in whole.values()):
+                continue
             block = -(-max((len(curve.y) for curve in whole.values()), default=1) // points)
             for arm in comparison.arms_of(environment):
                 runs = {seed: thin(curve, block) for (owner, seed), curve in whole.items() if owner == arm}
                 if runs:
-                    gathered[environment, arm, quantity.key] = ArmCurves(runs, band(list(runs.values())))
+                    gathered[environment, arm, quantity] = ArmCurves(runs, band(list(runs.values())))
     return gathered
 
 
-def logged(curves: Curves, environment: str, quantities: Sequence[Quantity]) -> tuple[Quantity, ...]:
-    """The quantities that at least one run of an environment has."""
-    keys = {key for name, _, key in curves if name == environment}
-    return tuple(quantity for quantity in quantities if quantity.key in keys)
+def other_metrics(runs: Sequence[RunRecord]) -> tuple[Quantity, ...]:
+    """What runs have logged beside the quantities that have a title of their own; first what this version knows."""
+    titled = {quantity.column for quantity in PAPER_PANELS + DIAGNOSTICS if quantity.table == "metrics"}
+    logged = {name: None for run in runs for name, values in run.metrics.items() if values.ndim == 1}
+    names = [name for name in METRICS if name in logged] + [name for name in logged if name not in METRICS]
+    return tuple(
+        Quantity(f"metric {name}", shown(name, 40), "metrics", name, "updates", METRICS.get(name, ""))
+        for name in names if name not in titled and name not in COUNTERS
+    )  # fmt: skip
+
+
+def diagnostics(curves: Curves, environment: str) -> tuple[Quantity, ...]:
+    """What the runs of an environment have beside the paper's panels."""
+    found = {quantity: None for name, _, quantity in curves if name == environment}
+    return tuple(quantity for quantity in found if quantity not in PAPER_PANELS)
 
 
 def series(run: RunRecord, quantity: Quantity) -> Series | None:

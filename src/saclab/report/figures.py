@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from saclab.report.arms import Arm, by_paper_name
-from saclab.report.curves import AXES, DIAGNOSTICS, PAPER_PANELS, ArmCurves, Curves, Quantity, logged
+from saclab.report.curves import AXES, PAPER_PANELS, ArmCurves, Curves, Quantity, diagnostics
 from saclab.report.notices import all_notices, notices
 from saclab.report.pairs import Pair
 from saclab.report.paper import paper_curves
@@ -60,10 +60,11 @@ def write_figures(
         for number, entry in enumerate(scores):
             name = file_name(entry.environment, number)
             runs = comparison.runs_of(entry.environment)
-            diagnostics = logged(curves, entry.environment, DIAGNOSTICS)
             figures = {
                 "panels": draw_curves(curves, entry.environment, PAPER_PANELS, styles),
-                "diagnostics": draw_curves(curves, entry.environment, diagnostics, styles),
+                "diagnostics": draw_curves(
+                    curves, entry.environment, diagnostics(curves, entry.environment), styles
+                ),
                 "intervals": draw_scores(entry, styles),
                 "improvement": draw_pairs(entry.pairs, shown(entry.environment)),
                 "profiles": draw_profiles(
@@ -128,7 +129,7 @@ def draw_curves(
     handles: dict[str, Any] = {}
     for panel, quantity in zip(panels, quantities):
         for arm, index in styles.items():
-            if of_arm := curves.get((environment, arm, quantity.key)):
+            if of_arm := curves.get((environment, arm, quantity)):
                 handles |= draw_arm(panel, of_arm, arm, quantity.axis, index, len(styles) > FEW_ARMS)
         if quantity.key == "evaluation_return":
             handles |= draw_paper(panel, environment, by_paper_name(styles))

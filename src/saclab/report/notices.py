@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from saclab.errors import UserError
-from saclab.protocols import training_settings
+from saclab.report.arms import own_training
 from saclab.report.runs import Comparison
 from saclab.report.text import shown
 from saclab.settings import TrainingSettings
@@ -16,13 +15,15 @@ from saclab.training.run_folder import RunRecord
 
 
 def scale_notice(run: RunRecord) -> str | None:
-    """How far a run's settings fall short of its protocol; None if they do not. Quick always falls short."""
+    """How far a run falls short of its protocol with its variant's own training; None if it does not.
+
+    Quick always falls short.
+    """
     config = run.config
     if config.protocol == "quick":
         return "quick protocol, far shorter than the paper's: too short to judge a variant by"
-    try:
-        full = training_settings(config.protocol, config.environment)
-    except UserError:
+    full = own_training(config)
+    if full is None:
         return None
     cuts = []
     if most_updates(config.training) < most_updates(full):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from saclab.report.arms import Arm, by_paper_name
-from saclab.report.curves import AXES, DIAGNOSTICS, PAPER_PANELS, Curves, Quantity, logged
+from saclab.report.curves import AXES, PAPER_PANELS, Curves, Quantity, diagnostics
 from saclab.report.paper import STEPS_PER_EPISODE, UPDATES_PER_EPISODE, paper_curves
 from saclab.report.runs import Comparison
 from saclab.report.scores import AggregateScores, EnvironmentScores
@@ -76,9 +76,10 @@ def environment_data(
     entry: EnvironmentScores, curves: Curves, places: dict[Arm, int], pool: AxisPool
 ) -> dict[str, Any]:
     name = entry.environment
-    diagnostics = logged(curves, name, DIAGNOSTICS)
     panels = [panel_data(quantity, "curves", name, curves, places, pool) for quantity in PAPER_PANELS]
-    panels += [panel_data(quantity, "diagnostics", name, curves, places, pool) for quantity in diagnostics]
+    panels += [
+        panel_data(quantity, "diagnostics", name, curves, places, pool) for quantity in diagnostics(curves, name)
+    ]
     return {
         "name": shown(name),
         "panels": panels,
@@ -105,7 +106,7 @@ def panel_data(
     """One quantity in one environment: each arm with its band and its runs."""
     arms = []
     for arm, place in places.items():
-        if of_arm := curves.get((environment, arm, quantity.key)):
+        if of_arm := curves.get((environment, arm, quantity)):
             band = of_arm.band
             runs = [{"seed": seed, "x": pool.places_of(curve.x), "y": numbers(curve.y)}
                     for seed, curve in of_arm.runs.items()]  # fmt: skip

@@ -23,6 +23,7 @@ from saclab.report.statistics import (
     performance_profile,
     steps_to_threshold,
 )
+from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord
 
 FINAL_SHARE = 0.1
@@ -132,13 +133,24 @@ def common_horizon(runs: Sequence[RunRecord]) -> float | None:
     unfinished one does: leaving it out would flatter a variant whose bad runs break off.
     """
     evaluated = [run for run in runs if has_score(run)]
-    budgets = {(run.config.training.max_steps, run.config.training.max_updates, run.config.training.max_episodes)
-               for run in runs}  # fmt: skip
+    budgets = {(planned_steps(run.config.training), run.config.training.max_episodes) for run in runs}
     limiting = evaluated if len(budgets) > 1 else [run for run in evaluated if run.result is None]
     if not limiting:
         return None
     shortest = min(float(run.evaluations["steps"][-1]) for run in limiting)
     return shortest if any(run.evaluations["steps"][-1] > shortest for run in evaluated) else None
+
+
+def planned_steps(settings: TrainingSettings) -> float:
+    """Environment steps that the limits on steps and updates allow; infinite if neither is set.
+
+    How many a limit on updates means depends on the update-to-data ratio, which may be a variant's own.
+    """
+    by_updates = np.inf
+    if settings.max_updates is not None:
+        rounds = -(-settings.max_updates // settings.updates_per_interval)
+        by_updates = settings.random_steps + rounds * settings.update_interval
+    return min(by_updates, np.inf if settings.max_steps is None else settings.max_steps)
 
 
 def score_run(run: RunRecord, horizon: float | None, threshold: float) -> RunScore:

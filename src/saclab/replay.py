@@ -42,8 +42,8 @@ class RowLayout(NamedTuple):
 
     def pack(self, transitions: Transitions) -> np.ndarray:
         """f32[N, width]."""
-        columns = [getattr(transitions, name).reshape(-1, width) for name, width in self.columns.items()]
-        rows: np.ndarray = np.concatenate(columns, axis=1)
+        *columns, terminated = transitions
+        rows: np.ndarray = np.concatenate([*columns, terminated[:, None]], axis=1)
         return rows.astype(np.float32, copy=False)
 
     def unpack(self, rows: Array) -> Batch:

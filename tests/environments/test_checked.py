@@ -57,7 +57,7 @@ SMALL = {"hidden_layers": (8,), "batch_size": 16, "random_steps": 40, "max_steps
         ({"start": [0.0, 0.0]}, r"in reset: its observation has shape \(2,\)"),
         ({"reward": [1.0]}, r"in step: its reward has shape \(1,\)"),
         ({"reward": "much"}, "in step: its reward is .*much"),
-        ({"terminated": None}, "in step: its terminated is None"),
+        ({"terminated": None}, "in step: its terminated is None and its truncated is False"),
     ],
     ids=["too short", "too long", "words", "reset", "reward of a shape", "reward in words", "flag"],
 )

@@ -75,19 +75,20 @@ class TrainingEnvironments:
         next_observation = np.empty_like(observation)
         terminated = np.zeros(len(self), bool)
         ended = []
-        scaled = self.spec.scale_action(action)
+        scaled, size = self.spec.scale_action(action), self.spec.observation_size
         for index, environment in enumerate(self.environments):
-            step = checked_step(environment, scaled[index], self.spec.observation_size)
-            next_observation[index], terminated[index] = step.observation, step.terminated
-            self._require_finite(index, next_observation[index], float(np.float32(step.reward)), scaled[index])
-            reward_terms[index] = split_reward(self.name, step.reward, step.info, self.reward_terms)
-            self.total_rewards[index] += step.reward
+            seen, reward, ends, cut, info = checked_step(environment, scaled[index], size)
+            next_observation[index], reward_terms[index, -1], terminated[index] = seen, reward, ends
+            self._require_finite(index, next_observation[index], float(reward_terms[index, -1]), scaled[index])
+            if self.reward_terms:
+                reward_terms[index] = split_reward(self.name, reward, info, self.reward_terms)
+            self.total_rewards[index] += reward
             self.lengths[index] += 1
-            if step.terminated or step.truncated:
-                ended.append(self._ended(index, step.terminated))
+            if ends or cut:
+                ended.append(self._ended(index, ends))
                 self._start_episode(index)
             else:
-                self.observation[index] = step.observation
+                self.observation[index] = seen
         return Transitions(observation, action, reward_terms, next_observation, terminated), ended
 
     def close(self) -> None:

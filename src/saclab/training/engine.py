@@ -132,8 +132,9 @@ def spec_of(config: Config) -> EnvironmentSpec:
         spec = environment_spec(config.environment, environment)
         if names := config.algorithm.reward_terms:
             checked_reset(environment, spec.observation_size, seed=0)
-            step = checked_step(environment, spec.scale_action(np.zeros(spec.action_size)), spec.observation_size)
-            split_reward(config.environment, step.reward, step.info, names)
+            middle = spec.scale_action(np.zeros(spec.action_size))
+            _, reward, _, _, info = checked_step(environment, middle, spec.observation_size)
+            split_reward(config.environment, reward, info, names)
         return spec
     finally:
         environment.close()

@@ -35,20 +35,21 @@ class Evaluator:
         """
         while len(self.environments) < len(seeds):
             self.environments.append(make_environment(self.name, self.arguments))
-        observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
+        size = self.spec.observation_size
+        observation = np.zeros((len(seeds), size), np.float32)
         for index, seed in enumerate(seeds):
-            observation[index] = checked_reset(self.environments[index], self.spec.observation_size, seed)
+            observation[index] = checked_reset(self.environments[index], size, seed)
         total_rewards, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
         active = list(range(len(seeds)))
         while active:
             actions = self.spec.scale_action(act(observation[active]))
             going_on = []
             for index, action in zip(active, actions, strict=True):
-                step = checked_step(self.environments[index], action, self.spec.observation_size)
-                observation[index] = step.observation
-                total_rewards[index] += step.reward
+                seen, reward, terminated, truncated, _ = checked_step(self.environments[index], action, size)
+                observation[index] = seen
+                total_rewards[index] += reward
                 lengths[index] += 1
-                if not (step.terminated or step.truncated):
+                if not (terminated or truncated):
                     going_on.append(index)
             active = going_on
             self._require_finite(observation, total_rewards)

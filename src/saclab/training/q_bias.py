@@ -127,13 +127,14 @@ def play(
         seen = np.asarray(observation, np.float32)[None]
         noise = generator.standard_normal((1, spec.action_size), np.float32)
         action, log_prob = act(critics.actor, seen, noise)
-        step = checked_step(environment, spec.scale_action(action)[0], spec.observation_size)
-        observation = step.observation
-        rows.append((seen[0], action[0], step.reward, float(log_prob[0])))
-        if step.terminated or step.truncated:
+        observation, reward, terminated, truncated, _ = checked_step(
+            environment, spec.scale_action(action)[0], spec.observation_size
+        )
+        rows.append((seen[0], action[0], reward, float(log_prob[0])))
+        if terminated or truncated:
             break
     observations, actions, rewards, log_probs = (np.array(column) for column in zip(*rows, strict=True))
-    return Episode(observations, actions, rewards, log_probs, step.terminated)
+    return Episode(observations, actions, rewards, log_probs, terminated)
 
 
 def known_returns(episode: Episode, alpha: float, discount: float) -> np.ndarray:

@@ -76,8 +76,13 @@ def polyak_update(targets: jax.Array, critic: jax.Array, rate: jax.Array, interv
     The result becomes the live target after step + 1 updates. Every `interval` updates that is a new slot, and the
     value before stays behind as a snapshot; otherwise it takes the place of the value before.
     """
-    if len(targets) == 0:
+    count = len(targets)
+    if count == 0:
         return targets
-    live = jnp.take(targets, live_slot(len(targets), interval, step), axis=0)
-    moved = (1 - rate) * live + rate * critic
-    return targets.at[live_slot(len(targets), interval, step + 1)].set(moved)
+    if count == 1:  # the slots are 0 then, which XLA cannot know
+        return ((1 - rate) * targets[0] + rate * critic)[None]
+    # XLA would otherwise divide once for each number of the ring.
+    slots = live_slot(count, interval, step), live_slot(count, interval, step + 1)
+    before, after = jax.lax.optimization_barrier(slots)  # type: ignore[no-untyped-call]
+    moved = (1 - rate) * jnp.take(targets, before, axis=0) + rate * critic
+    return targets.at[after].set(moved)

@@ -254,7 +254,7 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
         (("train", "Pendulum-v1", "--environment-arguments", '{"wrong": 1}'), "does not accept"),
         (("train", "no_such_package:Thing-v0"), "no_such_package"),
         (("resume", "nowhere"), "not a run folder"),
-        (("evaluate", "nowhere"), "no policy"),
+        (("evaluate", "nowhere"), "there is no folder nowhere"),
         (("report", "nowhere"), "no run folder"),
         (("compare", "Pendulum-v1", "--variants", "sac", "nonsense"), "unknown variant 'nonsense'"),
         (("compare", "Pendulum-v1", "--seeds", "0"), "seeds = 0"),

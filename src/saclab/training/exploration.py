@@ -21,7 +21,7 @@ class Exploration:
             seed: of the run.
             environments: N.
             action_size: A.
-            longest_noise: most steps for which one draw is held (FlashSAC, Kim et al. 2026).
+            longest_noise: most steps for which one draw is held (as in FlashSAC).
         """
         self.generator = seeds.generator(seed, "exploration")
         self.shape = environments, action_size

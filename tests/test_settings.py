@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import pytest
 
 from saclab.algorithm.heads import HEADS
@@ -10,7 +11,7 @@ from saclab.algorithm.losses import FACTORS
 from saclab.algorithm.networks import NETWORKS
 from saclab.algorithm.networks.network import ACTIVATIONS, PROJECTIONS
 from saclab.algorithm.optimizer import SCHEDULES
-from saclab.algorithm.scalars import OF_THE_CONTEXT, scalars
+from saclab.algorithm.scalars import OF_THE_CONTEXT, pack, scalars, unpack
 from saclab.algorithm.targets import REDUCTIONS
 from saclab.errors import SettingError
 from saclab.settings import UPDATES as UPDATE_NAMES
@@ -72,6 +73,9 @@ def test_every_plain_number_is_an_argument_of_the_update():
     assert (numbers["discount"], numbers["snapshot_interval"], numbers["adam_beta_1"]) == (0.5, 7, 0.25)
     assert (numbers["target_entropy"], scalars(AlgorithmSettings(), 3)["target_entropy"]) == (-9, -3)
     assert numbers["snapshot_interval"].dtype == "int32"
+    assert {name: (value, value.dtype) for name, value in unpack(jnp.asarray(pack(numbers))).items()} == {
+        name: (value, value.dtype) for name, value in numbers.items()
+    }
 
 
 def test_two_ways_to_say_the_same_structure_are_one():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from axes import AXES
 
-from saclab.algorithm.scalars import scalars
+from saclab.algorithm.scalars import pack, scalars
 from saclab.algorithm.types import Context
 from saclab.batch.program import Program, StepInputs
 from saclab.replay import RowLayout
@@ -33,7 +33,7 @@ def test_each_slot_is_updated_by_its_own_numbers(changes):
     settings = [each.algorithm for each in mixed(batch_size=16, **changes)]
     settings.append(config(batch_size=16, snapshot_interval=4, temperature="fixed", initial_temperature=0.0,
                            **changes).algorithm)  # fmt: skip
-    numbers, shape = [scalars(each, 2) for each in settings], structure(settings[0])
+    numbers, shape = [pack(scalars(each, 2)) for each in settings], structure(settings[0])
     init, update = compiled_init(shape, LAYOUT), compiled_update(shape, LAYOUT)
     states = [init(own, seeds.learner_key(run)) for run, own in enumerate(numbers)]
     random = np.random.default_rng(0)
@@ -71,7 +71,7 @@ def test_actions_are_those_of_each_runs_policy():
     configs = mixed()
     shape = structure(configs[0].algorithm)
     init = compiled_init(shape, LAYOUT)
-    actors = [init(scalars(each.algorithm, 2), seeds.learner_key(each.seed)).actor.weights for each in configs]
+    actors = [init(pack(scalars(each.algorithm, 2)), seeds.learner_key(each.seed)).actor.weights for each in configs]
     program = Program(shape, LAYOUT, environments=4, slots=3)
     random = np.random.default_rng(1)
     observation = random.standard_normal((3, 4, 3)).astype(np.float32)

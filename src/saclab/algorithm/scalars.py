@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from saclab.settings import AlgorithmSettings, plain_numbers
@@ -13,6 +15,9 @@ Scalars = dict[str, Any]
 
 OF_THE_CONTEXT = ("reward_weights",)
 """Settings that are arguments of the update in its Context."""
+
+NAMES = ("planned_updates", *(name for name in plain_numbers() if name not in OF_THE_CONTEXT))
+WHOLE = tuple(name for name in NAMES[1:] if type(getattr(AlgorithmSettings, name)) is int)
 
 
 def scalars(settings: AlgorithmSettings, action_size: int, planned_updates: int | None = None) -> Scalars:
@@ -28,9 +33,18 @@ def scalars(settings: AlgorithmSettings, action_size: int, planned_updates: int 
         "temperature_learning_rate": settings.temperature_learning_rate if learned else 0.0,
         "target_entropy": -action_size if settings.target_entropy is None else settings.target_entropy,
     }
-    numbers = {name: given.get(name, getattr(settings, name)) for name in plain_numbers() if name not in OF_THE_CONTEXT}
-    whole = {name for name in numbers if type(getattr(AlgorithmSettings, name)) is int}
-    kinds = {name: np.int32 if name in whole else np.float32 for name in numbers}
+    numbers = {name: given.get(name, getattr(settings, name)) for name in NAMES[1:]}
     return {"planned_updates": np.float32(planned_updates or 1)} | {
-        name: kinds[name](value) for name, value in numbers.items()
+        name: np.int32(value) if name in WHOLE else np.float32(value) for name, value in numbers.items()
     }
+
+
+def pack(numbers: Scalars) -> np.ndarray:
+    """i32[N]: all in one array, floating-point numbers as their bits, since each argument of a call takes its time."""
+    return np.array([np.asarray(numbers[name]).view(np.int32) for name in NAMES])
+
+
+def unpack(packed: jax.Array) -> Scalars:
+    """What was packed into i32[N]."""
+    reals = jax.lax.bitcast_convert_type(packed, jnp.float32)
+    return {name: (packed if name in WHOLE else reals)[place] for place, name in enumerate(NAMES)}

@@ -21,7 +21,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from saclab.algorithm.learner import make_learner
-from saclab.algorithm.scalars import Scalars
+from saclab.algorithm.scalars import unpack
 from saclab.algorithm.types import Context, LearnerState, Trained
 from saclab.replay import RowLayout
 from saclab.settings import AlgorithmSettings
@@ -106,7 +106,7 @@ class Program:
     def advance(
         self,
         updates: int,
-        numbers: Scalars,
+        numbers: jax.Array,
         state: LearnerState,
         replay: jax.Array,
         packed: jax.Array,
@@ -120,7 +120,7 @@ class Program:
         if updates not in self._advance:
 
             def advance(
-                numbers: Scalars, actor: jax.Array, others: dict[str, Any], replay: jax.Array, packed: jax.Array,
+                numbers: jax.Array, actor: jax.Array, others: dict[str, Any], replay: jax.Array, packed: jax.Array,
                 context: Context,
             ) -> Any:  # fmt: skip
                 state = LearnerState(**others | {"actor": Trained(actor, others["actor"])})
@@ -144,7 +144,7 @@ class Program:
     def _advance_slot(
         self,
         updates: int,
-        numbers: Scalars,
+        numbers: jax.Array,
         state: LearnerState,
         replay: jax.Array,
         packed: jax.Array,
@@ -157,7 +157,7 @@ class Program:
         def update(state: LearnerState, of_update: tuple[jax.Array, jax.Array]) -> tuple[LearnerState, jax.Array]:
             drawn, step = of_update
             batch = self.layout.unpack(replay[drawn])
-            state = self.learner.update(numbers, state, batch, context._replace(step=step))
+            state = self.learner.update(unpack(numbers), state, batch, context._replace(step=step))
             return state, state.report
 
         drawn, steps = inputs.unpack(packed, "drawn"), context.step + jnp.arange(updates, dtype=jnp.int32)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from saclab.algorithm.learner import Learner, make_learner
-from saclab.algorithm.scalars import Scalars, scalars
+from saclab.algorithm.scalars import pack, scalars, unpack
 from saclab.algorithm.types import Context, LearnerState
 from saclab.config import Config
 from saclab.errors import NonFiniteError
@@ -28,9 +28,9 @@ def learner_of(settings: AlgorithmSettings, layout: RowLayout) -> Learner:
     return make_learner(settings, layout.observation_size, layout.action_size)
 
 
-def numbers_of(config: Config, layout: RowLayout) -> Scalars:
-    """The plain numbers of a run, as arguments of what is compiled."""
-    return scalars(config.algorithm, layout.action_size, config.planned_updates)
+def numbers_of(config: Config, layout: RowLayout) -> np.ndarray:
+    """The plain numbers of a run i32[N], packed: an argument of what is compiled."""
+    return pack(scalars(config.algorithm, layout.action_size, config.planned_updates))
 
 
 def reward_weights(settings: AlgorithmSettings) -> np.ndarray:
@@ -46,25 +46,26 @@ def initial_learner(config: Config, layout: RowLayout) -> LearnerState:
 
 
 @lru_cache(maxsize=16)
-def compiled_init(shape: AlgorithmSettings, layout: RowLayout) -> Callable[[Scalars, np.ndarray], LearnerState]:
-    """(plain numbers, key u32[2]) -> the state before the first update; compiled once for all of a `structure`."""
-    return jax.jit(learner_of(shape, layout).init)
+def compiled_init(shape: AlgorithmSettings, layout: RowLayout) -> Callable[[np.ndarray, np.ndarray], LearnerState]:
+    """(plain numbers i32[N], key u32[2]) -> the state before the first update; compiled once for a `structure`."""
+    learner = learner_of(shape, layout)
+    return jax.jit(lambda numbers, key: learner.init(unpack(numbers), key))
 
 
 @lru_cache(maxsize=16)
 def compiled_update(
     shape: AlgorithmSettings, layout: RowLayout
-) -> Callable[[Scalars, LearnerState, np.ndarray, Context], tuple[LearnerState, jax.Array]]:
-    """(plain numbers, state, rows f32[B, width], context) -> (state, report f32[M]); the state given is used up.
+) -> Callable[[jax.Array, LearnerState, np.ndarray, Context], tuple[LearnerState, jax.Array]]:
+    """(plain numbers i32[N], state, rows f32[B, width], context) -> (state, report f32[M]); the state is used up.
 
     Compiled once for all settings of a `structure`.
     """
     learner = learner_of(shape, layout)
 
     def update(
-        numbers: Scalars, state: LearnerState, rows: jax.Array, context: Context
+        numbers: jax.Array, state: LearnerState, rows: jax.Array, context: Context
     ) -> tuple[LearnerState, jax.Array]:
-        state = learner.update(numbers, state, layout.unpack(rows), context)
+        state = learner.update(unpack(numbers), state, layout.unpack(rows), context)
         return state, state.report
 
     return jax.jit(update, donate_argnums=1)

@@ -236,8 +236,12 @@ class Session:
 
     def _save_run(self, run: int) -> Told:
         snapshot = self.engine.snapshot(run)
+        environments = self.engine.capture_environments(run)
+        self.engine.actor(run)  # waits for the updates: from here on, only writing can take long
         try:
-            yield run, self.writers[run].save(snapshot, self.engine.capture_environments(run))
+            with self.requests.while_saving():
+                saved = self.writers[run].save(snapshot, environments)
+            yield run, saved
         except NonFiniteError as error:
             yield self._fail(run, error, snapshot)
 

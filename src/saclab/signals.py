@@ -24,6 +24,7 @@ LAST_WORDS = (
     f"saclab: asked to stop, and for {SECONDS_TO_OBEY:g} seconds nothing could be saved (a compilation, or a step that "
     "takes long): ended. Nothing that was saved is lost, and the same command goes on from there\n"
 )
+SHOW_CURSOR = b"\x1b[?25h"  # a live display has hidden it
 PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
 
 
@@ -110,6 +111,8 @@ def end_unless_obeyed(descriptor: int, requests: Requests) -> None:
         time.sleep(POLL_SECONDS)
         waited = 0.0 if requests.saving else waited + POLL_SECONDS
     with suppress(OSError):
+        if sys.stdout is not None and sys.stdout.isatty():
+            os.write(1, SHOW_CURSOR)
         os.write(2, LAST_WORDS.encode())
     os._exit(EXIT_STATUS[number])
 

@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import subcommand
 
 from saclab.cli.results import Evaluate, Protocols, Record, Report, Variants
-from saclab.cli.settings import with_settings
+from saclab.cli.settings import with_absolute_paths, with_settings
 from saclab.cli.streams import output_lost, use_lasting_streams
 from saclab.cli.training import Compare, Reproduce, Resume, Train
 from saclab.exits import EXIT_FAILED, end_after
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command that the words ask for; its exit status."""
-    command = parse(arguments)
+    command = with_absolute_paths(parse(arguments))
     from rich.console import Console
 
     return int(command(Console()))

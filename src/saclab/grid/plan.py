@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from saclab.config import Config
+from saclab.files import same_directory
 from saclab.protocols import make_config, protocol_row
 from saclab.settings import require
 from saclab.training.run_folder import is_finished, run_path
@@ -87,6 +88,7 @@ def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 
     return numbers
 
 
+@same_directory()
 def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
     """Raise UserError before anything is started if an environment, a folder or the memory will not do.
 

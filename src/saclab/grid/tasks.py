@@ -82,7 +82,7 @@ class Task:
             workers: of a run group, the processes that step environments.
             patience: seconds that it waits for a run folder that is in use.
         """
-        runs = [{"config": run.cell.config.to_dict(), "folder": str(run.cell.folder.absolute())} for run in self.runs]
+        runs = [{"config": run.cell.config.to_dict(), "folder": str(run.cell.folder)} for run in self.runs]
         return {
             "runs": runs,
             "slots": self.slots,

@@ -236,9 +236,9 @@ class Session:
 
     def _save_run(self, run: int) -> Told:
         snapshot = self.engine.snapshot(run)
-        environments = self.engine.capture_environments(run)
-        self.engine.actor(run)  # waits for the updates: from here on, only writing can take long
         try:
+            environments = self.engine.capture_environments(run)
+            self.engine.actor(run)  # waits for the updates: from here on, only writing can take long
             with self.requests.while_saving():
                 saved = self.writers[run].save(snapshot, environments)
             yield run, saved

@@ -12,6 +12,7 @@ from saclab.grid.launch import launch
 from saclab.grid.plan import Cell, make_grid
 from saclab.grid.resources import Resources, chosen_resources
 from saclab.grid.tasks import RunStatus
+from saclab.limits import require_minutes
 from saclab.protocols import make_config
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
@@ -158,20 +159,21 @@ def compare(
         UserError: for a name or value that cannot work, or a missing extra; nothing has been started then.
     """
     resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
-    runs, report = absolute(runs), absolute(report or Path(runs) / "report")
-    cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name)
+    cells = make_grid(environments, variants, protocol, seeds, absolute(runs), environment_arguments, overrides, name)
     resources.require_startable(cells)
-    return _compare(cells, resources, report, show, tell, checkpoint_minutes)
+    return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes)
 
 
 def _compare(
     cells: Sequence[Cell],
     resources: Resources,
-    report: Path,
+    report: Path | str,
     show: Show | None,
     tell: Callable[[str], None],
     checkpoint_minutes: float,
 ) -> Comparison:
+    require_minutes(checkpoint_minutes)
+    report = absolute(report)
     if note := resources.note(cells):
         tell(note)
     with requests_from_signals() as requests:
@@ -231,8 +233,7 @@ def reproduce(
         overrides["max_updates"] = updates
     resources = chosen_resources(workers, None, batch)
     assert resources.workers is not None
-    runs, report = absolute(runs), absolute(report or Path(runs) / "report")
-    cells = make_grid(environments, variants, "paper", seeds, runs, {}, overrides)
+    cells = make_grid(environments, variants, "paper", seeds, absolute(runs), {}, overrides)
     resources.require_startable(cells)
     left = sum(not cell.finished for cell in cells)
     if left:
@@ -240,7 +241,7 @@ def reproduce(
         hours = forecast_hours(cells, resources.workers, resources.threads, resources.batch)
         about = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.0f} minutes"
         tell(f"forecast: about {about} with {resources.workers} worker(s); stop at any time, the same command goes on")
-    return _compare(cells, resources, report, show, tell, checkpoint_minutes)
+    return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes)
 
 
 def last(stream: Iterable[Sequence[RunStatus]]) -> list[RunStatus]:

@@ -16,6 +16,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from saclab.config import Config
 from saclab.errors import SettingError
+from saclab.limits import require_threads
 from saclab.protocols import make_config
 from saclab.variants import COMPARED
 
@@ -201,7 +202,7 @@ def parse_arguments(text: str) -> dict[str, Any]:
     """Keyword arguments of an environment from JSON; raises SettingError for anything but an object."""
     try:
         values = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise SettingError("environment_arguments", text, f"not JSON ({error}); write '{{\"key\": 1.0}}'") from error
     if not isinstance(values, dict):
         raise SettingError("environment_arguments", text, "write a JSON object, such as '{\"key\": 1.0}'")
@@ -212,9 +213,8 @@ def limit_threads(threads: int | None) -> None:
     """Hold XLA and NumPy to a number of cores; works only before they are first imported."""
     from saclab.machine import thread_limits
 
+    require_threads(threads)
     if threads is not None:
-        if threads < 1:
-            raise SettingError("threads", threads, "use at least 1")
         os.environ.update(thread_limits(threads))
 
 

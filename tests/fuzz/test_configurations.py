@@ -195,11 +195,12 @@ LARGEST_TRAINED = {
     "max_steps": 320, "random_steps": 310, "batch_size": 310,
 }  # fmt: skip
 """Setting -> the largest value that is trained with here."""
+FEW = max(5, settings().max_examples // 20)  # of the profile's, each of which takes seconds
 
 
 @pytest.mark.slow
 @given(LINE)
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much], max_examples=12)
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much], max_examples=FEW)
 def test_what_is_accepted_and_small_trains(tmp_path_factory, line):
     """To its end, or to a number that is not finite, which is told in words."""
     config = accepted([*SMALL, *flat(line)])

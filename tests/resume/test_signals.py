@@ -84,7 +84,6 @@ def test_a_closed_terminal_saves_and_stops_and_nohup_goes_on(tmp_path):
         ["bash", "-c", f"exec {line} > out 2>&1"], cwd=tmp_path, env=environment_of(), process_group=0
     )
     evaluated = len((tmp_path / RUN / "evaluations.csv").read_text().splitlines())
-    process.send_signal(signal.SIGHUP)  # even at once
     wait_for(lambda: len((tmp_path / RUN / "evaluations.csv").read_text().splitlines()) > evaluated + 1)
     process.send_signal(signal.SIGHUP)
     time.sleep(1)

@@ -98,6 +98,7 @@ def test_a_closed_terminal_saves_and_stops_and_nohup_goes_on(tmp_path):
 SLEEPING = """
 import os, time
 import gymnasium
+import numpy as np
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 
 class Sleeping(PendulumEnv):
@@ -110,6 +111,12 @@ class Sleeping(PendulumEnv):
             open({file!r}, "w").write("asleep")
             time.sleep(600)
         return super().step(action)
+
+    def saclab_capture(self):
+        return {{"state": np.array(self.state), "steps": np.array(self.steps)}}
+
+    def saclab_restore(self, captured):
+        self.state, self.steps = captured["state"].copy(), int(captured["steps"])
 
 gymnasium.register("Sleeping-v0", Sleeping, max_episode_steps=200)
 """

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from saclab import replay
 from saclab.environments.vector import Transitions
-from saclab.errors import SettingError
-from saclab.replay import ReplayBuffer, RowLayout, available_memory, require_memory
+from saclab.machine import available_memory
+from saclab.replay import ReplayBuffer, RowLayout
 
 LAYOUT = RowLayout(observation_size=3, action_size=2)
 
@@ -107,30 +106,6 @@ def test_a_drawn_batch_does_not_change_when_its_rows_are_overwritten():
     kept = rows.copy()
     buffer.rows[:] = -1
     np.testing.assert_array_equal(rows, kept)
-
-
-def test_a_buffer_that_does_not_fit_is_refused_with_its_size(monkeypatch):
-    monkeypatch.setattr(replay, "available_memory", lambda: 2**30)
-    layout = RowLayout(376, 17)  # Humanoid-v4: 771 numbers
-    require_memory(348_000, layout)  # 348000 · 771 · 4 = 0.9995 GiB
-    with pytest.raises(SettingError, match=r"replay_capacity = 1000000: .*771 numbers take 2\.87 GiB.*1\.00 GiB") as e:
-        require_memory(1_000_000, layout)
-    advised = int(str(e.value).split("--replay-capacity ")[1].split()[0])
-    assert 200_000 < advised < 348_000
-    require_memory(advised, layout)
-
-
-def test_several_runs_at_once_need_several_buffers(monkeypatch):
-    monkeypatch.setattr(replay, "available_memory", lambda: 2**30)
-    layout = RowLayout(376, 17)
-    with pytest.raises(SettingError, match=r"in each of 3 runs at once.*or a smaller --workers"):
-        require_memory(200_000, layout, runs_at_once=3)
-    require_memory(200_000, layout)
-
-
-def test_a_system_that_does_not_tell_its_memory_refuses_nothing(monkeypatch):
-    monkeypatch.setattr(replay, "available_memory", lambda: None)
-    require_memory(10**12, LAYOUT)
 
 
 def test_this_machine_has_some_memory_left():

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from saclab.config import Config
+from saclab.files import absolute
 from saclab.grid.launch import launch
 from saclab.grid.plan import Cell, make_grid
 from saclab.grid.resources import Resources, chosen_resources
 from saclab.grid.tasks import RunStatus
+from saclab.limits import require_minutes
 from saclab.protocols import make_config
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
@@ -57,7 +59,7 @@ def train(
         UserError: for a name or value that cannot work, or a folder that holds a run with other settings.
     """
     config = make_config(environment, variant, protocol, seed, environment_arguments, overrides)
-    return _train(config, run_path(Path(runs), config, name), on_event, checkpoint_minutes)
+    return _train(config, run_path(absolute(runs), config, name), on_event, checkpoint_minutes)
 
 
 def resume(
@@ -79,9 +81,10 @@ def resume(
     """
     from saclab.environments.make import require_import_allowed
 
-    config = read_config(Path(run))
+    run = absolute(run)
+    config = read_config(run)
     require_import_allowed(config.environment, imports)
-    return _train(config, Path(run), on_event, checkpoint_minutes)
+    return _train(config, run, on_event, checkpoint_minutes)
 
 
 def _train(config: Config, folder: Path, on_event: Callable[[Event], None], checkpoint_minutes: float) -> RunRecord:
@@ -156,19 +159,21 @@ def compare(
         UserError: for a name or value that cannot work, or a missing extra; nothing has been started then.
     """
     resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
-    cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name)
+    cells = make_grid(environments, variants, protocol, seeds, absolute(runs), environment_arguments, overrides, name)
     resources.require_startable(cells)
-    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
+    return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes)
 
 
 def _compare(
     cells: Sequence[Cell],
     resources: Resources,
-    report: Path,
+    report: Path | str,
     show: Show | None,
     tell: Callable[[str], None],
     checkpoint_minutes: float,
 ) -> Comparison:
+    require_minutes(checkpoint_minutes)
+    report = absolute(report)
     if note := resources.note(cells):
         tell(note)
     with requests_from_signals() as requests:
@@ -228,7 +233,7 @@ def reproduce(
         overrides["max_updates"] = updates
     resources = chosen_resources(workers, None, batch)
     assert resources.workers is not None
-    cells = make_grid(environments, variants, "paper", seeds, runs, {}, overrides)
+    cells = make_grid(environments, variants, "paper", seeds, absolute(runs), {}, overrides)
     resources.require_startable(cells)
     left = sum(not cell.finished for cell in cells)
     if left:
@@ -236,7 +241,7 @@ def reproduce(
         hours = forecast_hours(cells, resources.workers, resources.threads, resources.batch)
         about = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.0f} minutes"
         tell(f"forecast: about {about} with {resources.workers} worker(s); stop at any time, the same command goes on")
-    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
+    return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes)
 
 
 def last(stream: Iterable[Sequence[RunStatus]]) -> list[RunStatus]:

@@ -6,6 +6,8 @@ import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+LONGEST_SHOWN = 200  # characters
+
 
 class UserError(Exception):
     """Something the user gave cannot work; the message names it and the way out.
@@ -18,7 +20,7 @@ class SettingError(UserError):
     """A setting's value cannot work."""
 
     def __init__(self, setting: str, value: object, way_out: str) -> None:
-        super().__init__(f"{setting} = {value!r}: {way_out}")
+        super().__init__(f"{setting} = {shown(value)}: {way_out}")
         self.setting, self.value, self.way_out = setting, value, way_out
 
 
@@ -41,10 +43,16 @@ class NonFiniteError(RunBroken):
     """An environment or an update gave a number that is not finite."""
 
 
+def shown(value: object) -> str:
+    """A value in an error's line: its middle is left out if it is long."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN // 2]}…{text[-LONGEST_SHOWN // 2 :]}"
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The error for a name that is not among the known ones; suggests the nearest."""
     known = sorted(known)
     nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
     hint = f"did you mean {nearest[0]!r}? " if nearest else ""
     listed = ", ".join(known) if len(known) <= 60 else f"{len(known)} of them"
-    return UserError(f"unknown {kind} {name!r}: {hint}known: {listed}")
+    return UserError(f"unknown {kind} {shown(name)}: {hint}known: {listed}")

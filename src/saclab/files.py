@@ -1,10 +1,40 @@
-"""Write files so that a crash leaves the old one or the new one, never a part of either."""
+"""Where files lie, and how they are written: a crash leaves the old one or the new one, never a part of either."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from saclab.errors import UserError
+
+
+def absolute(path: Path | str) -> Path:
+    """A path that the user has given, as it stays when an environment changes the working directory.
+
+    Raises:
+        UserError: if it begins at a working directory that has been removed.
+    """
+    try:
+        return Path(path).absolute()
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: the working directory does not exist any more: change to another one") from error
+
+
+@contextmanager
+def same_directory() -> Iterator[None]:
+    """Go back to this working directory at the end: an environment that was made for a look at it may have left it.
+
+    Processes that are started later find their packages there.
+    """
+    descriptor = os.open(".", getattr(os, "O_PATH", os.O_RDONLY))
+    try:
+        yield
+    finally:
+        os.fchdir(descriptor)
+        os.close(descriptor)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

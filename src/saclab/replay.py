@@ -11,8 +11,6 @@ from saclab.algorithm.networks.network import Array
 from saclab.algorithm.types import Batch
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import Transitions
-from saclab.errors import SettingError
-from saclab.machine import available_memory
 from saclab.settings import AlgorithmSettings
 
 
@@ -96,37 +94,6 @@ class ReplayBuffer:
 def draw(generator: np.random.Generator, size: int, batch_size: int) -> np.ndarray:
     """i64[batch_size]: rows of a buffer that holds `size` transitions, drawn uniformly and independently."""
     return generator.integers(0, size, batch_size)
-
-
-GIB = 2**30
-
-
-def require_memory(
-    capacity: int,
-    layout: RowLayout,
-    runs_at_once: int = 1,
-    fewer: str = "--workers",
-    available: int | None = None,
-) -> None:
-    """Refuse a replay buffer that memory cannot hold once it is full.
-
-    Args:
-        capacity: transitions.
-        layout: of a transition.
-        runs_at_once: each has a buffer.
-        fewer: the option that would lower their number.
-        available: bytes; None for the machine's free memory.
-    """
-    needed, available = runs_at_once * replay_bytes(capacity, layout), available or available_memory()
-    if available is not None and needed > available:
-        fits = int(available / needed * capacity * 0.8)
-        together = f" in each of {runs_at_once} runs at once" if runs_at_once > 1 else ""
-        raise SettingError(
-            "replay_capacity", capacity,
-            f"{capacity} transitions of {layout.width} numbers{together} take {needed / GIB:.2f} GiB, and "
-            f"{available / GIB:.2f} GiB are free: use --replay-capacity {fits} or less"
-            + (f" or a smaller {fewer}" if runs_at_once > 1 else ""),
-        )  # fmt: skip
 
 
 def replay_bytes(capacity: int, layout: RowLayout) -> int:

@@ -12,6 +12,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from saclab.errors import SettingError, unknown_name
+from saclab.limits import require_representable
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -135,6 +136,7 @@ class AlgorithmSettings:
         for name in field_names(type(self)):
             if isinstance(value := getattr(self, name), list):  # as Python's users and JSON write them
                 object.__setattr__(self, name, tuple(value))
+        require_representable(vars(self), plain_numbers())
         require_ranges(self)
         require_possible(self)
 
@@ -251,6 +253,7 @@ class TrainingSettings:
     """Updates that are averaged into one line of metrics.jsonl."""
 
     def __post_init__(self) -> None:
+        require_representable(vars(self), ())
         positive = ("parallel_environments", "update_interval", "updates_per_interval", "replay_capacity",
                     "evaluation_episodes", "log_interval")  # fmt: skip
         for name in positive:

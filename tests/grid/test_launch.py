@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from saclab import replay
+from saclab import memory
 from saclab.errors import SettingError, UserError
 from saclab.grid.launch import launch
 from saclab.grid.local import core_groups, local_pool
@@ -49,9 +49,11 @@ def test_memory_must_do_for_the_largest_replay(
 ) -> None:
     """On Pendulum-v1 a row has 9 numbers: 100,000 of them take 3.6 MB, the larger buffers twice as much."""
     monkeypatch.setitem(VARIANTS, "large", Variant("Large", "", row))
-    monkeypatch.setattr(replay, "available_memory", lambda: 10**7)
-    require_startable(make_grid(["Pendulum-v1"], ["sac", "sac-auto"], "quick", 1, tmp_path), 2, "--workers")
-    cells = make_grid(["Pendulum-v1"], order, "quick", 1, tmp_path)
+    monkeypatch.setattr(memory, "available_memory", lambda: 10**7)
+    tiny = {"hidden_layers": (4,), "batch_size": 8}
+    small = make_grid(["Pendulum-v1"], ["sac", "sac-auto"], "quick", 1, tmp_path, overrides=tiny)
+    require_startable(small, 2, "--workers")
+    cells = make_grid(["Pendulum-v1"], order, "quick", 1, tmp_path, overrides=tiny)
     with pytest.raises(SettingError, match="in each of 2 runs at once"):
         require_startable(cells, 2, "--workers")
     require_startable(cells, 0, "--workers")

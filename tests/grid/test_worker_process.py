@@ -15,7 +15,7 @@ from resume.helpers import wait_for
 from saclab.grid.worker_process import WorkerProcess
 from saclab.training.lock import locked, wait_until_free
 
-CHILD = "import os, sys, time; sys.path[:0] = {path!r}; from saclab.grid.worker_process import die_with; {then}"
+CHILD = "import os, sys, time; sys.path[:0] = {path!r}; from saclab.signals import die_with; {then}"
 
 
 def worker(folder: Path, program: str, monkeypatch: pytest.MonkeyPatch) -> WorkerProcess:
@@ -61,7 +61,7 @@ def test_a_worker_whose_launcher_is_gone_does_not_begin():
     child = CHILD.format(path=sys.path, then="die_with(1); print('begun')")
     ended = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (1, "")
-    assert "launcher, process 1, is gone" in ended.stderr
+    assert "started this one, 1, is gone" in ended.stderr
 
 
 def test_a_run_folder_that_is_in_use_is_waited_for(tmp_path):

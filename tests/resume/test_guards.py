@@ -13,7 +13,7 @@ import pytest
 import safetensors.numpy
 from environments import tiny  # noqa: F401 - registers them
 
-from saclab import replay
+from saclab import memory
 from saclab.errors import NonFiniteError, SettingError, TrainingFailed
 from saclab.protocols import make_config
 from saclab.training import checkpoint, failure, loop, run_writer
@@ -174,7 +174,7 @@ def test_a_replay_buffer_takes_the_memory_that_was_forecast():
 
 
 def test_what_cannot_fit_is_refused_before_anything_is_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(replay, "available_memory", lambda: 2**20)
+    monkeypatch.setattr(memory, "available_memory", lambda: 2**20)
     with pytest.raises(SettingError, match=r"replay_capacity = 200000: .*GiB.*--replay-capacity \d+ or less"):
         list(loop.train(small_config("Pendulum-v1", replay_capacity=200_000), tmp_path / "run"))
     assert not (tmp_path / "run").exists()

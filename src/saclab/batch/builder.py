@@ -12,7 +12,8 @@ from saclab.batch.engine import DeviceEngine
 from saclab.batch.program import Program
 from saclab.batch.replay import DeviceReplay
 from saclab.config import Config
-from saclab.replay import ReplayBuffer, layout_of, require_memory
+from saclab.memory import require_memory
+from saclab.replay import ReplayBuffer, layout_of
 from saclab.settings import structure
 from saclab.training.checkpoint import Checkpoint, read_checkpoint
 from saclab.training.engine import spec_of
@@ -33,7 +34,7 @@ class DeviceBuilder:
             workers: processes that step the environments.
 
         Raises:
-            UserError: if the environment cannot be trained on, or the replay buffers do not fit in memory.
+            UserError: if the environment cannot be trained on, or the runs do not fit in memory.
         """
         self.configs, self.workers = configs, workers
         training, self.spec = configs[0].training, spec_of(configs[0])
@@ -42,7 +43,7 @@ class DeviceBuilder:
             structure(configs[0].algorithm), self.layout, training.parallel_environments, max(slots, len(configs))
         )
         self.slots = self.program.slots
-        require_memory(training.replay_capacity, self.layout, self.slots, "--batch", memory_of_devices(self.program))
+        require_memory(configs[0], self.layout, self.slots, "--batch", memory_of_devices(self.program))
         self.replay = DeviceReplay(self.program, training.replay_capacity)
 
     def read(self, run: int, path: Path) -> Checkpoint:

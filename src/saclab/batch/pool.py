@@ -205,6 +205,7 @@ class PoolWorker:
             own_seeds = all_seeds[start : start + self.count(run)]
             shares.append({"run": run, "first": run * environments + start, "seeds": own_seeds})
         task = {
+            "engine": os.getpid(),
             "runs": buffers.sizes.runs,
             "environments": buffers.sizes.environments,
             "layout": buffers.sizes.layout._asdict(),

@@ -20,6 +20,7 @@ from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import NonFiniteError, RunBroken, UserError
 from saclab.replay import RowLayout
+from saclab.signals import die_with
 from saclab.training.captured import join_arrays, split_arrays
 from saclab.training.evaluation import Evaluator
 from saclab.training.learners import learner_of
@@ -158,8 +159,10 @@ def main() -> None:
     """Answer until the input ends."""
     commands, answers = os.dup(0), os.dup(1)
     os.dup2(2, 1)  # what an environment prints must not end up among the answers
+    task, _ = receive(commands)
+    die_with(task["engine"])
     try:
-        worker = EnvironmentWorker(receive(commands)[0])
+        worker = EnvironmentWorker(task)
     except UserError as error:
         send(answers, {"user_error": str(error)})
         return

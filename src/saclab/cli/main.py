@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -11,29 +10,36 @@ import tyro
 from tyro.conf import subcommand
 
 from saclab.cli.results import Evaluate, Protocols, Record, Report, Variants
-from saclab.cli.settings import with_settings
-from saclab.cli.training import EXIT_USER_ERROR, Compare, Reproduce, Resume, Train
-from saclab.errors import UserError
-from saclab.signals import EXIT_STATUS
+from saclab.cli.settings import with_absolute_paths, with_settings
+from saclab.cli.streams import output_lost, use_lasting_streams
+from saclab.cli.training import Compare, Reproduce, Resume, Train
+from saclab.exits import EXIT_FAILED, end_after
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status.
 
-    0: done. 1: a run failed. 2: bad input, a number that is not finite counted in. 130, 143: saved and stopped by
-    SIGINT or SIGTERM.
+    0: done. 1: a run failed, or what there was to show could not be written (a closed pipe is no failure). 2: bad
+    input, a number that is not finite counted in. 129, 130, 143: saved and stopped by SIGHUP, SIGINT or SIGTERM.
     """
+    use_lasting_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        command = parse(arguments or ["--help"])
-        from rich.console import Console
+        status = run(arguments or ["--help"])
+    except SystemExit as end:  # of the parser, which has said why
+        status = end.code if isinstance(end.code, int) else EXIT_FAILED if end.code else 0
+    except BaseException as error:
+        status, line = end_after(error)
+        print(f"saclab: {line}", file=sys.stderr)
+    return status or (EXIT_FAILED if output_lost() else 0)
 
-        return int(command(Console()))
-    except UserError as error:
-        print(f"saclab: {error}", file=sys.stderr)
-        return EXIT_USER_ERROR
-    except KeyboardInterrupt:  # outside training, where there is nothing to save
-        return EXIT_STATUS[signal.SIGINT]
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command that the words ask for; its exit status."""
+    command = with_absolute_paths(parse(arguments))
+    from rich.console import Console
+
+    return int(command(Console()))
 
 
 def parse(arguments: Sequence[str]) -> Any:

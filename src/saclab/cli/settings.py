@@ -8,11 +8,13 @@ import dataclasses
 import inspect
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypedDict, get_type_hints
 
 from tyro.conf import OmitArgPrefixes, arg
 
 from saclab.config import Config
+from saclab.files import absolute
 from saclab.protocols import make_config
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
@@ -55,6 +57,22 @@ def options_of(kind: type[AlgorithmSettings | TrainingSettings], shown: object) 
     made = dictionary(kind.__name__, entries, total=False)
     made.__doc__ = kind.__doc__
     return made
+
+
+def with_absolute_paths(command: Any) -> Any:
+    """A command with every path of its line as it stays when an environment changes the working directory."""
+
+    def stable(value: Any) -> Any:
+        match value:
+            case Path():
+                return absolute(value)
+            case tuple():
+                return tuple(map(stable, value))
+        return with_absolute_paths(value) if dataclasses.is_dataclass(value) else value
+
+    return dataclasses.replace(
+        command, **{field.name: stable(getattr(command, field.name)) for field in dataclasses.fields(command)}
+    )
 
 
 def default_text(value: object) -> str:

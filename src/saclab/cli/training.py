@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,15 +15,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional
 
 from saclab.config import Config
-from saclab.errors import NonFiniteError, SettingError, TrainingFailed
+from saclab.errors import SettingError
+from saclab.limits import require_threads
 from saclab.protocols import make_config
 from saclab.variants import COMPARED
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-EXIT_USER_ERROR = 2
-EXIT_FAILED = 1
 
 Given = Mapping[str, Any]
 """The settings that were given, by name; `saclab.cli.settings` makes an option of each."""
@@ -205,7 +202,7 @@ def parse_arguments(text: str) -> dict[str, Any]:
     """Keyword arguments of an environment from JSON; raises SettingError for anything but an object."""
     try:
         values = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise SettingError("environment_arguments", text, f"not JSON ({error}); write '{{\"key\": 1.0}}'") from error
     if not isinstance(values, dict):
         raise SettingError("environment_arguments", text, "write a JSON object, such as '{\"key\": 1.0}'")
@@ -216,9 +213,8 @@ def limit_threads(threads: int | None) -> None:
     """Hold XLA and NumPy to a number of cores; works only before they are first imported."""
     from saclab.machine import thread_limits
 
+    require_threads(threads)
     if threads is not None:
-        if threads < 1:
-            raise SettingError("threads", threads, "use at least 1")
         os.environ.update(thread_limits(threads))
 
 
@@ -244,13 +240,9 @@ def train_and_show(
             stream = trackers.tensorboard(stream)
         if wandb_project is not None:
             stream = trackers.wandb(stream, wandb_project, config, folder)
-        try:
-            for _ in display.show_run(stream, console):
-                pass
-        except TrainingFailed as error:
-            print(f"saclab: {error}", file=sys.stderr)
-            return EXIT_USER_ERROR if isinstance(error, NonFiniteError) else EXIT_FAILED
+        for _ in display.show_run(stream, console):
+            pass
         if requests.stop:
             console.print(f"saved; continue with: saclab resume {folder}", soft_wrap=True, markup=False)
-            return EXIT_STATUS.get(requests.stop, EXIT_FAILED)
+            return EXIT_STATUS[requests.stop]
     return 0

@@ -13,9 +13,12 @@ from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
 from saclab.config import Config
+from saclab.errors import TrainingFailed
+from saclab.exits import end_after
 from saclab.grid.plan import Cell
 from saclab.grid.tasks import make_statuses, make_tasks
 from saclab.machine import thread_limits
+from saclab.signals import die_with, how_it_ended
 
 if TYPE_CHECKING:
     from saclab.training.engine import EngineBuilder
@@ -92,15 +95,22 @@ def run_seconds(config: Config, cost: Cost) -> float:
 
 
 def measure_in_process(kinds: Sequence[Kind], threads: int) -> list[Cost]:
-    """Measure each kind one after the other, in a process with as many threads as a worker has."""
+    """Measure each kind one after the other, in a process with as many threads as a worker has.
+
+    Raises:
+        TrainingFailed: if that process ends without an answer.
+    """
     described = [([config.to_dict() for config in kind.configs], kind.slots, kind.workers) for kind in kinds]
     process = subprocess.run(
         [sys.executable, "-m", "saclab.grid.forecast"],
-        input=json.dumps(described).encode(),
-        stdout=subprocess.PIPE,
-        check=True,
+        input=json.dumps({"parent": os.getpid(), "kinds": described}),
+        capture_output=True,
+        text=True,
         env=os.environ | thread_limits(threads),
+        start_new_session=True,  # Ctrl-C is for this process, and that one dies with it
     )
+    if process.returncode:
+        raise TrainingFailed(f"no forecast ({how_it_ended(process.returncode, process.stderr)})")
     return [Cost(*values) for values in json.loads(process.stdout)]
 
 
@@ -144,13 +154,23 @@ def endless(config: Config) -> Config:
     return dataclasses.replace(config, training=training)
 
 
-def main() -> None:
+def main() -> int:
+    """Measure what standard input says; the exit status."""
+    task, answer = json.load(sys.stdin), os.dup(1)
+    os.dup2(2, 1)  # what an environment prints must not end up in the answer
+    die_with(task["parent"])
     kinds = [
         Kind(tuple(Config.from_dict(config) for config in configs), slots, workers)
-        for configs, slots, workers in json.load(sys.stdin)
+        for configs, slots, workers in task["kinds"]
     ]
-    print(json.dumps([measure(kind) for kind in kinds]))
+    try:
+        os.write(answer, json.dumps([measure(kind) for kind in kinds]).encode())
+    except Exception as error:
+        status, line = end_after(error)
+        print(line, file=sys.stderr)
+        return status
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from saclab.config import Config
+from saclab.files import same_directory
 from saclab.protocols import make_config, protocol_row
 from saclab.settings import require
 from saclab.training.run_folder import is_finished, run_path
@@ -87,23 +88,25 @@ def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 
     return numbers
 
 
+@same_directory()
 def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
     """Raise UserError before anything is started if an environment, a folder or the memory will not do.
 
-    The runs of one environment need not have replay buffers of one size: a variant's row may say another capacity or
-    other reward terms. The memory must do for the largest in all that are filled at once.
+    The runs of one environment need not be of one size: a variant's row may say another capacity of the replay buffer,
+    other networks or reward terms. The memory must do for as many of the largest as there are at once.
 
     Args:
         cells: the grid.
-        at_once: runs whose replay buffers this machine's memory must hold together; 0 if they lie elsewhere.
+        at_once: runs that this machine's memory must hold together; 0 if they are trained elsewhere.
         fewer: the option that would lower their number.
     """
     from saclab.environments.make import environment_spec, make_environment
-    from saclab.replay import layout_of, replay_bytes, require_memory
+    from saclab.memory import needed_memory, require_memory
+    from saclab.replay import layout_of
     from saclab.training.starts import require_same_config
 
     specs: dict[tuple[str, str], EnvironmentSpec] = {}
-    buffers: dict[int, tuple[int, RowLayout]] = {}
+    needed: dict[int, tuple[Config, RowLayout]] = {}
     for cell in cells:
         config = cell.config
         if (cell.folder / "config.json").exists():
@@ -114,7 +117,6 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
             specs[key] = environment_spec(config.environment, environment)
             environment.close()
         layout = layout_of(specs[key], config.algorithm)
-        buffer = config.training.replay_capacity, layout
-        buffers[replay_bytes(*buffer)] = buffer
+        needed[sum(needed_memory(config, layout))] = config, layout
     if at_once:
-        require_memory(*buffers[max(buffers)], at_once, fewer)
+        require_memory(*needed[max(needed)], at_once, fewer)

@@ -13,6 +13,7 @@ from saclab.grid.local import local_pool
 from saclab.grid.plan import Cell, require_startable
 from saclab.grid.pool import WorkerPool
 from saclab.grid.ray import ray_pool
+from saclab.limits import require_threads
 from saclab.machine import accelerator, usable_cores
 from saclab.settings import require
 
@@ -69,6 +70,7 @@ def chosen_resources(
         UserError: for a value that cannot work.
     """
     require(workers is None or workers >= 1, "workers", workers, "use at least 1")
+    require_threads(threads)
     batch = chosen_batch(batch, launcher, ray_gpus)
     cores = len(usable_cores())
     threads = threads or (cores if batch and launcher == "local" else max(1, int(ray_cpus or 1)))

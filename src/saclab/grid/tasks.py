@@ -11,7 +11,7 @@ from typing import Any, Literal
 from saclab.grid.groups import run_groups
 from saclab.grid.plan import Cell
 from saclab.grid.rate import RateMeter
-from saclab.signals import how_it_ended
+from saclab.signals import EXIT_STATUS, how_it_ended
 
 Status = Literal["waiting", "running", "finished", "interrupted", "failed"]
 
@@ -82,7 +82,7 @@ class Task:
             workers: of a run group, the processes that step environments.
             patience: seconds that it waits for a run folder that is in use.
         """
-        runs = [{"config": run.cell.config.to_dict(), "folder": str(run.cell.folder.absolute())} for run in self.runs]
+        runs = [{"config": run.cell.config.to_dict(), "folder": str(run.cell.folder)} for run in self.runs]
         return {
             "runs": runs,
             "slots": self.slots,
@@ -99,14 +99,15 @@ class Task:
     def ended(self, code: int, stopping: bool, errors: str) -> None:
         """Note how the process ended; a worker that said nothing of a run's end has failed it.
 
-        One that was told to stop before it could listen, while it was still importing, has lost nothing.
+        One that was told to stop before it could listen, while it was still importing, or that could not save in time,
+        has lost nothing that was saved.
         """
         for run in self.runs:
             if run.status != "running":
                 continue
             if code == 0:
                 run.status, run.fraction = "finished", 1.0
-            elif stopping and code == -signal.SIGTERM:
+            elif code in EXIT_STATUS.values() or (stopping and code == -signal.SIGTERM):
                 run.status = "interrupted"
             else:
                 run.status = "failed"

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saclab.config import Config
-from saclab.errors import TrainingFailed, UserError
-from saclab.grid.worker_process import die_with
+from saclab.exits import end_after
+from saclab.signals import die_with
 from saclab.training.lock import wait_until_free
 
 if TYPE_CHECKING:
@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
 
 def main() -> int:
-    """Train the runs; exit status 0 if they finished or were stopped on request, 2 for a user's error, 1 otherwise."""
-    task = json.load(sys.stdin)
+    """Train the runs; exit status 0 if they finished or were stopped on request, else that of `saclab train`."""
+    task, answers = json.load(sys.stdin), os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what an environment prints must not end up among the answers
     if task["cores"]:
         os.sched_setaffinity(0, task["cores"])  # before JAX starts its threads, which inherit it
     if task["launcher"]:
@@ -37,7 +38,7 @@ def main() -> int:
 
         def tell(run: int, **message: object) -> None:
             try:
-                print(json.dumps({"run": run, **message}), flush=True)
+                print(json.dumps({"run": run, **message}), file=answers, flush=True)
             except BrokenPipeError:  # the launcher is gone: nobody would look after these runs
                 requests.stop = requests.stop or 1
 
@@ -48,10 +49,11 @@ def main() -> int:
                     tell(run, **message)
                     if message["event"] in ("finished", "failed"):
                         going_on.discard(run)
-        except (UserError, TrainingFailed) as error:
+        except Exception as error:
+            status, line = end_after(error)
             for run in going_on:
-                tell(run, event="failed", message=str(error))
-            return 2 if isinstance(error, UserError) else 1
+                tell(run, event="failed", message=line)
+            return status
     return 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import select
@@ -14,8 +13,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
-
-PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
 
 
 class WorkerProcess:
@@ -97,14 +94,3 @@ class WorkerProcess:
         while not self.silent:
             self.read()
         self.process.wait()
-
-
-def die_with(launcher: int) -> None:
-    """Have this process killed at the moment in which its launcher dies.
-
-    On Linux; other systems leave it alive until it next has something to say to the launcher.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != launcher:  # it was dead before this was asked for
-        sys.exit(f"the launcher, process {launcher}, is gone")

@@ -14,6 +14,7 @@ from saclab.environments.make import EnvironmentSpec, environment_spec, make_env
 from saclab.environments.reward_terms import split_reward
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken
+from saclab.files import same_directory
 from saclab.replay import RowLayout
 from saclab.training.checkpoint import Checkpoint, CheckpointError
 from saclab.training.evaluation import EvaluationEpisodes
@@ -125,6 +126,7 @@ class EnvironmentStateError(CheckpointError):
         self.run = run
 
 
+@same_directory()
 def spec_of(config: Config) -> EnvironmentSpec:
     """What a learner must know of a run's environment; raises UserError if it cannot be trained on."""
     environment = make_environment(config.environment, config.environment_arguments)

@@ -11,7 +11,8 @@ from saclab.algorithm.types import Context
 from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import RunBroken
-from saclab.replay import ReplayBuffer, layout_of, require_memory
+from saclab.memory import require_memory
+from saclab.replay import ReplayBuffer, layout_of
 from saclab.settings import structure
 from saclab.training import seeds
 from saclab.training.checkpoint import Checkpoint, read_checkpoint
@@ -32,12 +33,12 @@ class LocalBuilder:
         """Make room for its replay buffer.
 
         Raises:
-            UserError: if the environment cannot be trained on, or the replay buffer does not fit in memory.
+            UserError: if the environment cannot be trained on, or the run does not fit in memory.
         """
         self.configs = [config]
         self.spec = spec_of(config)
         self.layout = layout_of(self.spec, config.algorithm)
-        require_memory(config.training.replay_capacity, self.layout)
+        require_memory(config, self.layout)
         self.replay = ReplayBuffer(config.training.replay_capacity, self.layout)
 
     def read(self, run: int, path: Path) -> Checkpoint:

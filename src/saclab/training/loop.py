@@ -9,6 +9,7 @@ from pathlib import Path
 
 from saclab.config import Config
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
+from saclab.limits import require_minutes
 from saclab.machine import machine_facts
 from saclab.training.engine import Engine, EngineBuilder
 from saclab.training.events import Event, Failed, Interrupted, Started
@@ -77,6 +78,7 @@ def train_runs(
     Yields:
         The place of a run, and what it tells.
     """
+    require_minutes(checkpoint_minutes)
     with writing_to(folders), ExitStack() as stack:
         for folder in folders:
             stack.enter_context(locked(folder))
@@ -237,7 +239,11 @@ class Session:
     def _save_run(self, run: int) -> Told:
         snapshot = self.engine.snapshot(run)
         try:
-            yield run, self.writers[run].save(snapshot, self.engine.capture_environments(run))
+            environments = self.engine.capture_environments(run)
+            self.engine.actor(run)  # waits for the updates: from here on, only writing can take long
+            with self.requests.while_saving():
+                saved = self.writers[run].save(snapshot, environments)
+            yield run, saved
         except NonFiniteError as error:
             yield self._fail(run, error, snapshot)
 

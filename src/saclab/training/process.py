@@ -13,6 +13,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version as jaxlib_version
 
+from saclab.files import absolute
 from saclab.machine import accelerator_plugins, processor_features, visible_threads
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
@@ -70,7 +71,7 @@ def use_compilation_cache() -> None:
 
 def compilation_cache_folder() -> Path:
     """One for each version of jaxlib, processor and number of threads: its machine code is for no other."""
-    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    user_cache = absolute(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     made_for = f"{processor_features()} {visible_threads('NPROC')}"
     digest = hashlib.sha256(made_for.encode()).hexdigest()[:12]
     return user_cache / "saclab" / "xla" / f"jaxlib-{jaxlib_version.__version__}-{digest}"

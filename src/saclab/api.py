@@ -87,6 +87,7 @@ def resume(
 def _train(config: Config, folder: Path, on_event: Callable[[Event], None], checkpoint_minutes: float) -> RunRecord:
     from saclab.training.loop import train as training_events
 
+    folder = folder.absolute()  # the environment may change the working directory
     with requests_from_signals() as requests:
         for event in training_events(config, folder, requests, checkpoint_minutes):
             on_event(event)
@@ -155,10 +156,16 @@ def compare(
     Raises:
         UserError: for a name or value that cannot work, or a missing extra; nothing has been started then.
     """
+    runs, report = places(runs, report)
     resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
     cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name)
     resources.require_startable(cells)
-    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
+    return _compare(cells, resources, report, show, tell, checkpoint_minutes)
+
+
+def places(runs: Path | str, report: Path | str | None) -> tuple[Path, Path]:
+    """Where the runs and their report go, wherever an environment changes to later."""
+    return Path(runs).absolute(), Path(report or Path(runs) / "report").absolute()
 
 
 def _compare(
@@ -226,6 +233,7 @@ def reproduce(
     overrides: dict[str, Any] = {"q_bias_episodes": Q_BIAS_EPISODES}
     if updates is not None:
         overrides["max_updates"] = updates
+    runs, report = places(runs, report)
     resources = chosen_resources(workers, None, batch)
     assert resources.workers is not None
     cells = make_grid(environments, variants, "paper", seeds, runs, {}, overrides)
@@ -236,7 +244,7 @@ def reproduce(
         hours = forecast_hours(cells, resources.workers, resources.threads, resources.batch)
         about = f"{hours:.1f} hours" if hours >= 1 else f"{60 * hours:.0f} minutes"
         tell(f"forecast: about {about} with {resources.workers} worker(s); stop at any time, the same command goes on")
-    return _compare(cells, resources, Path(report or Path(runs) / "report"), show, tell, checkpoint_minutes)
+    return _compare(cells, resources, report, show, tell, checkpoint_minutes)
 
 
 def last(stream: Iterable[Sequence[RunStatus]]) -> list[RunStatus]:

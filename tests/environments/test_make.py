@@ -88,7 +88,7 @@ from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import NonFiniteError
 make_environment("HalfCheetah-v4").reset(seed=0)
 environments = TrainingEnvironments("HalfCheetah-v4", {}, [0])
-data = environments.environments[0].unwrapped.data
+data = environments.environments[0].environment.unwrapped.data
 data.qvel[:] = 1e12
 try:
     environments.step(np.zeros((1, 6), np.float32))

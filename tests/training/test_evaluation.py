@@ -71,4 +71,6 @@ def test_a_return_is_the_sum_of_all_rewards_up_to_the_time_limit():
 def test_evaluated_actions_are_scaled_to_the_bounds():
     evaluator = Evaluator("Counting-v0", {"low": (2.0,), "high": (6.0,)})
     evaluator.run(lambda observation: np.full((len(observation), 1), 0.5, np.float32), [1])
-    assert [action.tolist() for action in evaluator.environments[0].unwrapped.actions] == [[5.0]] * tiny.TIME_LIMIT
+    assert [action.tolist() for action in evaluator.environments[0].environment.unwrapped.actions] == [
+        [5.0]
+    ] * tiny.TIME_LIMIT

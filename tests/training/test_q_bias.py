@@ -14,7 +14,7 @@ from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import scalars
 from saclab.batch.loop import train_batch
 from saclab.config import Config
-from saclab.environments.make import environment_spec, make_environment
+from saclab.environments.checked import CheckedEnvironment
 from saclab.protocols import make_config
 from saclab.settings import AlgorithmSettings
 from saclab.training.loop import train
@@ -48,14 +48,14 @@ def test_steps_near_a_time_limit_are_left_out() -> None:
 def pendulum_bias(discount: float, shift: float, reduction: str = "minimum", critics_moved: int = 2) -> QBias:
     """The bias of random critics, of some of which the output's bias is moved by `shift`."""
     settings = AlgorithmSettings(hidden_layers=(8,), discount=discount)
-    environment = make_environment("Pendulum-v1")
-    spec = environment_spec("Pendulum-v1", environment)
+    environment = CheckedEnvironment("Pendulum-v1")
+    spec = environment.spec
     learner = make_learner(settings, spec.observation_size, spec.action_size)
     state = learner.init(scalars(settings, spec.action_size), jax.random.PRNGKey(0))
     critic = np.array(state.critic.weights)
     critic[:critics_moved, -1] += shift  # the last parameter is the output's bias
     critics = Critics(learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount, reduction)
-    return measure_q_bias(critics, environment, spec, [1, 2], np.random.default_rng(0))
+    return measure_q_bias(critics, environment, [1, 2], np.random.default_rng(0))
 
 
 def test_moving_q_moves_the_bias_by_as_much_over_the_mean_return() -> None:

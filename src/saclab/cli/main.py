@@ -12,8 +12,8 @@ from tyro.conf import subcommand
 
 from saclab.cli.results import Evaluate, Protocols, Record, Report, Variants
 from saclab.cli.settings import with_settings
-from saclab.cli.training import EXIT_USER_ERROR, Compare, Reproduce, Resume, Train
-from saclab.errors import UserError
+from saclab.cli.training import EXIT_FAILED, EXIT_USER_ERROR, Compare, Reproduce, Resume, Train
+from saclab.errors import NonFiniteError, TrainingFailed, UserError, for_terminal
 from saclab.signals import EXIT_STATUS
 
 
@@ -29,9 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from rich.console import Console
 
         return int(command(Console()))
-    except UserError as error:
-        print(f"saclab: {error}", file=sys.stderr)
-        return EXIT_USER_ERROR
+    except (UserError, TrainingFailed) as error:
+        print(for_terminal(error), file=sys.stderr)
+        return EXIT_USER_ERROR if isinstance(error, UserError | NonFiniteError) else EXIT_FAILED
     except KeyboardInterrupt:  # outside training, where there is nothing to save
         return EXIT_STATUS[signal.SIGINT]
 

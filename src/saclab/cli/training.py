@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional
 
 from saclab.config import Config
-from saclab.errors import NonFiniteError, SettingError, TrainingFailed
+from saclab.errors import NonFiniteError, SettingError, TrainingFailed, for_terminal
 from saclab.protocols import make_config
 from saclab.variants import COMPARED
 
@@ -248,7 +248,7 @@ def train_and_show(
             for _ in display.show_run(stream, console):
                 pass
         except TrainingFailed as error:
-            print(f"saclab: {error}", file=sys.stderr)
+            print(for_terminal(error), file=sys.stderr)
             return EXIT_USER_ERROR if isinstance(error, NonFiniteError) else EXIT_FAILED
         if requests.stop:
             console.print(f"saved; continue with: saclab resume {folder}", soft_wrap=True, markup=False)

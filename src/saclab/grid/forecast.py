@@ -13,6 +13,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
 from saclab.config import Config
+from saclab.environments.foreign import prints_apart
 from saclab.grid.plan import Cell
 from saclab.grid.tasks import make_statuses, make_tasks
 from saclab.machine import thread_limits
@@ -149,7 +150,8 @@ def main() -> None:
         Kind(tuple(Config.from_dict(config) for config in configs), slots, workers)
         for configs, slots, workers in json.load(sys.stdin)
     ]
-    print(json.dumps([measure(kind) for kind in kinds]))
+    with prints_apart() as answers:
+        os.write(answers, json.dumps([measure(kind) for kind in kinds]).encode())
 
 
 if __name__ == "__main__":

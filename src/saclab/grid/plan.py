@@ -98,7 +98,7 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
         at_once: runs whose replay buffers this machine's memory must hold together; 0 if they lie elsewhere.
         fewer: the option that would lower their number.
     """
-    from saclab.environments.make import environment_spec, make_environment
+    from saclab.environments.checked import CheckedEnvironment
     from saclab.replay import layout_of, replay_bytes, require_memory
     from saclab.training.starts import require_same_config
 
@@ -110,8 +110,8 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
             require_same_config(cell.folder, config)
         key = config.environment, json.dumps(config.environment_arguments, sort_keys=True, default=repr)
         if key not in specs:
-            environment = make_environment(config.environment, config.environment_arguments)
-            specs[key] = environment_spec(config.environment, environment)
+            environment = CheckedEnvironment(config.environment, config.environment_arguments)
+            specs[key] = environment.spec
             environment.close()
         layout = layout_of(specs[key], config.algorithm)
         buffer = config.training.replay_capacity, layout

@@ -6,13 +6,17 @@ The task comes as JSON on standard input; each event goes out as a line of JSON 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saclab.config import Config
+from saclab.environments.foreign import prints_apart
+from saclab.environments.watch import log
 from saclab.errors import TrainingFailed, UserError
 from saclab.grid.worker_process import die_with
 from saclab.training.lock import wait_until_free
@@ -33,14 +37,16 @@ def main() -> int:
         wait_until_free(Path(run["folder"]), task["patience"])
     from saclab.signals import requests_from_signals
 
-    with requests_from_signals(process_ends=True) as requests:
+    with requests_from_signals(process_ends=True) as requests, prints_apart() as answers:
 
         def tell(run: int, **message: object) -> None:
             try:
-                print(json.dumps({"run": run, **message}), flush=True)
+                write_line(answers, {"run": run, **message})
             except BrokenPipeError:  # the launcher is gone: nobody would look after these runs
                 requests.stop = requests.stop or 1
 
+        log.addHandler(logging.StreamHandler())
+        log.addHandler(Teller(tell))
         going_on = set(range(len(task["runs"])))
         try:
             for run, event in events(task, requests):
@@ -53,6 +59,27 @@ def main() -> int:
                 tell(run, event="failed", message=str(error))
             return 2 if isinstance(error, UserError) else 1
     return 0
+
+
+LINE = threading.Lock()  # a thread that watches environments speaks too
+
+
+def write_line(answers: int, message: Mapping[str, object]) -> None:
+    content = memoryview(json.dumps(message).encode() + b"\n")
+    with LINE:
+        while content:
+            content = content[os.write(answers, content) :]
+
+
+class Teller(logging.Handler):
+    """Tells the launcher what is logged of environments."""
+
+    def __init__(self, tell: Callable[..., None]) -> None:
+        super().__init__()
+        self.tell = tell
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.tell(0, event="warned", message=record.getMessage())
 
 
 def events(task: dict[str, Any], requests: Requests) -> Iterator[tuple[int, Event]]:

@@ -57,7 +57,7 @@ def test_arguments_reach_the_environment():
         ("HalfCheeta-v4", {}, "unknown environment 'HalfCheeta-v4': did you mean 'HalfCheetah-v4'"),
         ("halfcheetah-v4", {}, "did you mean 'HalfCheetah-v4'"),
         ("Pendulum-v9", {}, "did you mean 'Pendulum-v1'"),
-        ("Half Cheetah", {}, "environment = 'Half Cheetah': Malformed"),
+        ("Half Cheetah", {}, "environment = 'Half Cheetah': Error: Malformed"),
         ("CartPole-v1", {}, "environment = 'CartPole-v1': its actions are discrete"),
         ("Odd-v0", {"kind": "discrete action"}, "its actions are discrete"),
         ("Odd-v0", {"kind": "dict action"}, "its action space is Dict"),

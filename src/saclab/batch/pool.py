@@ -286,7 +286,7 @@ def pass_on_warnings(told: int) -> None:
     """Log what a process says of its environments beside its answers, until it ends."""
     with os.fdopen(told, errors="replace") as lines:
         for line in lines:
-            log.warning(line.rstrip("\n"))
+            log.warning(line.rstrip("\n"), extra={"stalled": True})
 
 
 def require_whole(reply: dict[str, Any]) -> None:

@@ -38,7 +38,8 @@ class Watch:
             self.told = True
             log.warning(
                 f"{self.who}: {waiting_for} has taken {now - self.since:.0f} seconds and is not done: the run waits "
-                "for it; if it hangs, stop the run and mend the environment"
+                "for it; if it hangs, stop the run and mend the environment",
+                extra={"stalled": True},
             )
 
 

@@ -66,7 +66,7 @@ def make_grid(
         for environment in dict.fromkeys(environments)
         for variant in variants
     ]
-    return [Cell(config, run_path(Path(runs), config, name)) for config in configs]
+    return [Cell(config, run_path(Path(runs).absolute(), config, name)) for config in configs]
 
 
 def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 0) -> Sequence[int]:

@@ -19,7 +19,7 @@ from saclab.environments.foreign import prints_apart
 from saclab.environments.watch import log
 from saclab.errors import TrainingFailed, UserError
 from saclab.grid.worker_process import die_with
-from saclab.training.lock import wait_until_free
+from saclab.training.lock import InUse, wait_until_free
 
 if TYPE_CHECKING:
     from saclab.training.events import Event
@@ -56,7 +56,7 @@ def main() -> int:
                         going_on.discard(run)
         except (UserError, TrainingFailed) as error:
             for run in going_on:
-                tell(run, event="failed", message=str(error))
+                tell(run, event="in_use" if isinstance(error, InUse) else "failed", message=str(error))
             return 2 if isinstance(error, UserError) else 1
     return 0
 
@@ -79,7 +79,8 @@ class Teller(logging.Handler):
         self.tell = tell
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.tell(0, event="warned", message=record.getMessage())
+        stalled = getattr(record, "stalled", False)
+        self.tell(0, event="stalled" if stalled else "warned", message=record.getMessage())
 
 
 def events(task: dict[str, Any], requests: Requests) -> Iterator[tuple[int, Event]]:

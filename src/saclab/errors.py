@@ -78,7 +78,10 @@ def traceback_of(error: BaseException) -> str:
         text = "".join(tracebacks.format_exception(error))
     except BaseException:
         text = in_words(error)
-    return text[-TRACEBACK_LETTERS:].encode(errors="backslashreplace").decode()
+    if len(text) > TRACEBACK_LETTERS:
+        half = TRACEBACK_LETTERS // 2
+        text = f"{text[:half]}\n…\n{text[-half:]}"
+    return text.encode(errors="backslashreplace").decode()
 
 
 def for_terminal(error: UserError | TrainingFailed) -> str:

@@ -29,7 +29,7 @@ class Calls:
         self.context = contextvars.copy_context()
         self.watch = Watch(f"environment {name}")
 
-    def __call__(self, what: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    def __call__(self, what: str, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Any:
         """What `function` gives.
 
         Args:
@@ -48,7 +48,7 @@ class Calls:
                 raise
             raise self.raised(what, error) from error
 
-    def run(self, what: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    def run(self, what: str, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Any:
         """The same; what it raises is raised."""
         watch = self.watch
         watch.waiting_for = what

@@ -125,9 +125,12 @@ def not_made(environment: str, arguments: Mapping[str, Any], error: BaseExceptio
     else:
         advice = "" if not ahead_of_dm_control(error) else "; this dm_control needs MuJoCo 3: pip install 'mujoco<4'"
         refused = UserError(f"environment = {environment!r}: it raised an error in __init__: {in_words(error)}{advice}")
-    last = list(traceback.walk_tb(error.__traceback__))[-1][0]
+    first = error
+    while first.__cause__ is not None:
+        first = first.__cause__
+    last = list(traceback.walk_tb(first.__traceback__))[-1][0]
     if last.f_globals.get("__name__") != gymnasium.make.__module__:  # which calls it: the arguments are not its own
-        refused.traceback = traceback_of(error)
+        refused.traceback = traceback_of(first)
     return refused
 
 

@@ -124,6 +124,17 @@ def test_scaled_actions_never_leave_the_bounds_by_rounding():
     np.testing.assert_allclose(scaled, [low, high], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["i1", "u1", "i2", "i4"])
+def test_whole_numbers_reach_all_of_their_type(kind):
+    """The difference of two of them need not be one."""
+    limits = np.iinfo(kind)
+    spec = EnvironmentSpec(1, 1, np.array([limits.min], kind), np.array([limits.max], kind))
+    scaled = spec.scale_action(np.array([[-1.0], [0.0], [1.0]], np.float32))
+    assert scaled.dtype == np.dtype(kind)
+    assert scaled[[0, 2], 0].tolist() == [limits.min, limits.max]
+    assert abs(int(scaled[1, 0]) - (limits.min + limits.max) / 2) <= 0.5
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize(("broken", "message"), [("observation", r"observation entries \[1\]"), ("reward", "reward")])
 def test_a_value_that_is_not_finite_is_refused_with_its_place(broken, message, value):

@@ -46,7 +46,7 @@ def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[event
             match event:
                 case events.Started():
                     where = f"resumed at step {event.resumed_at_step}" if event.resumed_at_step else "started"
-                    console.print(f"{escape(str(event.run))} {where}")
+                    console.print(f"{escape(str(event.run))} {where}", soft_wrap=True)
                     for note in event.notes:
                         console.print(f"  {escape(note)}", soft_wrap=True)
                 case events.Progress():

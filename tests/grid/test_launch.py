@@ -204,6 +204,7 @@ def test_a_run_that_hangs_or_dies_keeps_no_other_from_its_end(tmp_path: Path) ->
     assert statuses[1].message == "its worker ended (exit status 7)"
 
 
+@pytest.mark.slow
 def test_what_an_environment_prints_is_no_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]), prepend=os.pathsep)
     (cell,) = make_grid(["environments.rogue:Meddling-v0"], ["sac"], "quick", 1, tmp_path / "runs",
@@ -213,6 +214,7 @@ def test_what_an_environment_prints_is_no_message(tmp_path: Path, monkeypatch: p
     assert (cell.folder / "worker.log").stat().st_size > 10**6
 
 
+@pytest.mark.slow
 def test_a_run_of_another_process_is_waited_for_and_taken_over(tmp_path: Path) -> None:
     cells = grid(tmp_path, max_updates=100_000)
     other, ours = launch(cells, local_pool(2, threads=1), Requests()), Requests()

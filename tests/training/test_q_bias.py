@@ -6,9 +6,11 @@ import dataclasses
 import math
 from pathlib import Path
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 
 from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import scalars
@@ -45,10 +47,12 @@ def test_steps_near_a_time_limit_are_left_out() -> None:
     assert len(known_returns(episode([1.0] * 5, [0.0] * 5, terminated=True), 0.1, 0.5)) == 5
 
 
-def pendulum_bias(discount: float, shift: float, reduction: str = "minimum", critics_moved: int = 2) -> QBias:
+def pendulum_bias(
+    discount: float, shift: float, reduction: str = "minimum", critics_moved: int = 2, name: str = "Pendulum-v1"
+) -> QBias:
     """The bias of random critics, of some of which the output's bias is moved by `shift`."""
     settings = AlgorithmSettings(hidden_layers=(8,), discount=discount)
-    environment = CheckedEnvironment("Pendulum-v1")
+    environment = CheckedEnvironment(name)
     spec = environment.spec
     learner = make_learner(settings, spec.observation_size, spec.action_size)
     state = learner.init(scalars(settings, spec.action_size), jax.random.PRNGKey(0))
@@ -63,6 +67,22 @@ def test_moving_q_moves_the_bias_by_as_much_over_the_mean_return() -> None:
     assert high.mean_q - low.mean_q == pytest.approx(3.0, rel=1e-4)
     assert high.mean_bias - low.mean_bias == pytest.approx(3.0 / abs(low.mean_return), rel=1e-4)
     assert high.bias_spread == pytest.approx(low.bias_spread, rel=1e-3)
+
+
+class Rewriting(PendulumEnv):
+    """Writes every observation into the same array."""
+
+    def _get_obs(self) -> np.ndarray:
+        self.seen = getattr(self, "seen", np.zeros(3, np.float32))
+        self.seen[:] = super()._get_obs()
+        return self.seen
+
+
+gymnasium.register("Rewriting-v0", Rewriting, max_episode_steps=200)
+
+
+def test_an_environment_may_write_over_its_own_observations() -> None:
+    assert pendulum_bias(0.9, 0.0, name="Rewriting-v0") == pendulum_bias(0.9, 0.0)
 
 
 def test_the_critics_are_reduced_as_the_policy_reduces_them() -> None:

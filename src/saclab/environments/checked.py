@@ -16,7 +16,7 @@ from saclab.environments.simulator import State, capture_state, restore_state
 from saclab.errors import RunBroken, in_words
 
 Step = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
-"""Observation f32[O], reward, terminated, truncated, info."""
+"""Observation [O] of real numbers, reward, terminated, truncated, info."""
 NUMBERS = "fiub"
 """Kinds of NumPy's types that are real numbers."""
 
@@ -37,10 +37,10 @@ class CheckedEnvironment:
         self.name = name
         self.calls = Calls(name)
         self.environment, self.spec = make_with_spec(self.calls, name, arguments, render_mode)
-        self.size = self.spec.observation_size
+        self.shape = (self.spec.observation_size,)
 
     def reset(self, seed: int | None) -> np.ndarray:
-        """Start an episode: the first observation f32[O]."""
+        """Start an episode: the first observation [O], as `step` gives it."""
         with signals_kept():
             given = self.calls("reset", self.environment.reset, seed=seed)
         if not isinstance(given, tuple) or len(given) != 2:
@@ -48,19 +48,27 @@ class CheckedEnvironment:
         return self._observation("reset", given[0])
 
     def step(self, action: np.ndarray) -> Step:
-        """Take a step with an action within the environment's bounds."""
+        """Take a step with an action within the environment's bounds.
+
+        Returns:
+            The observation may be an array that the environment writes its next one into: who keeps it copies it.
+        """
         given = self.calls("step", self.environment.step, action)
         if not isinstance(given, tuple) or len(given) != 5:
             what = f"{len(given)} values" if isinstance(given, tuple) else type(given).__name__
             self.refuse("step", f"it returned {what}", "(observation, reward, terminated, truncated, info)")
-        seen, reward, terminated, truncated, info = given
-        return (
-            self._observation("step", seen),
-            float(reward) if isinstance(reward, float) else self._reward(reward),
-            terminated if terminated is True or terminated is False else self._flag("terminated", terminated),
-            truncated if truncated is True or truncated is False else self._flag("truncated", truncated),
-            info if isinstance(info, dict) else self.refuse("step", f"its info is {type(info).__name__}", "a dict"),
-        )
+        seen, reward, ends, cut, info = given
+        if type(seen) is not np.ndarray or seen.shape != self.shape or seen.dtype.char not in "df":
+            seen = self._observation("step", seen)
+        if type(reward) is not float:
+            reward = float(reward) if isinstance(reward, float) else self._reward(reward)
+        if ends is not True and ends is not False:
+            ends = self._flag("terminated", ends)
+        if cut is not True and cut is not False:
+            cut = self._flag("truncated", cut)
+        if not isinstance(info, dict):
+            self.refuse("step", f"its info is {type(info).__name__}", "a dict")
+        return seen, reward, ends, cut, info
 
     def capture(self) -> State | None:
         """The exact state of its episode; None if it cannot be captured."""
@@ -101,20 +109,17 @@ class CheckedEnvironment:
         )
 
     def _observation(self, call: str, given: Any) -> np.ndarray:
-        """A copy f32[O]: the environment may write its next one into the same array."""
-        if type(given) is np.ndarray and given.shape == (self.size,) and given.dtype.char in "df":
-            return given.astype(np.float32)
         try:
-            seen = np.asarray(given)
+            seen: np.ndarray = np.asarray(given)
         except Exception as error:
             self.refuse(call, f"its observation is no array ({in_words(error)})", "an array of real numbers")
-        if seen.shape != (self.size,):
-            declared = f"shape ({self.size},), as its observation space says,"
+        if seen.shape != self.shape:
+            declared = f"shape {self.shape}, as its observation space says,"
             self.refuse(call, f"its observation has shape {seen.shape}", declared)
         if seen.dtype.kind not in NUMBERS or np.ma.is_masked(given):
             masked = " with masked entries" if np.ma.is_masked(given) else ""
             self.refuse(call, f"its observation has type {seen.dtype}{masked}", "an array of real numbers")
-        return seen.astype(np.float32)
+        return seen
 
     def _reward(self, given: Any) -> float:
         try:

@@ -41,22 +41,25 @@ class Calls:
         Raises:
             RunBroken: whatever it raises, with the traceback.
         """
-        try:
-            return self.run(what, function, *arguments, **options)
-        except BaseException as error:
-            if meant_for_saclab(error):
-                raise
-            raise self.raised(what, error) from error
-
-    def run(self, what: str, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Any:
-        """The same; what it raises is raised."""
         watch = self.watch
         watch.waiting_for = what
         try:
             return self.context.run(function, *arguments, **options)
+        except BaseException as error:
+            if meant_for_saclab(error):
+                raise
+            raise self.raised(what, error) from error
         finally:
             watch.waiting_for = ""
             watch.count += 1
+
+    def run(self, what: str, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Any:
+        """The same; what it raises is raised."""
+        try:
+            return self(what, function, *arguments, **options)
+        except RunBroken as broken:
+            error = broken.__cause__ or broken
+        raise error
 
     def raised(self, what: str, error: BaseException) -> RunBroken:
         """What a run is told of an error in its environment's own code."""

@@ -120,7 +120,7 @@ def play(critics: Critics, environment: CheckedEnvironment, seed: int, generator
     rows: list[tuple[np.ndarray, np.ndarray, float, float]] = []
     act: Callable[..., tuple[np.ndarray, np.ndarray]] = critics.policy.sample
     while True:
-        seen = observation[None]
+        seen = np.array(observation, np.float32)[None]  # the environment may write over its own
         noise = generator.standard_normal((1, spec.action_size), np.float32)
         action, log_prob = act(critics.actor, seen, noise)
         observation, reward, terminated, truncated, _ = environment.step(spec.scale_action(action)[0])

@@ -13,15 +13,15 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import soak
 from soak import GROWTH_BYTES, Sample, grown, sample, slope
 
-LEVEL = [Sample(10, 17, 0, 2**29)] * 9
+LEVEL = [Sample(10, 17, 0, 2**29, 2**28)] * 9
 
 
 def test_what_grows_after_the_warm_up_is_named():
     assert grown(LEVEL) == {}
-    assert grown([Sample(4, 3, 0, 2**20), *LEVEL[1:]]) == {}, "the first third warms up"
-    assert grown([*LEVEL[1:], Sample(12, 17, 1, 2**29)]) == {"descriptors": 2, "children": 1}
-    lost = [each._replace(resident_bytes=2**29 + number * 2 * GROWTH_BYTES) for number, each in enumerate(LEVEL)]
-    assert grown(lost) == {"resident_bytes": 2 * GROWTH_BYTES}
+    assert grown([Sample(4, 3, 0, 2**20, 2**19), *LEVEL[1:]]) == {}, "the first third warms up"
+    assert grown([*LEVEL[1:], Sample(12, 17, 1, 2**29, 2**28)]) == {"descriptors": 2, "children": 1}
+    lost = [each._replace(allocated_bytes=2**28 + number * 2 * GROWTH_BYTES) for number, each in enumerate(LEVEL)]
+    assert grown(lost) == {"allocated_bytes": 2 * GROWTH_BYTES}
 
 
 def test_one_outlier_makes_no_slope():

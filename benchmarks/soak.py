@@ -81,8 +81,12 @@ def sample() -> Sample:
     children = sum(len((task / "children").read_text().split()) for task in tasks)
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return Sample(
-        len(list(Path("/proc/self/fd").iterdir())), len(tasks), children, pages * os.sysconf("SC_PAGE_SIZE"), allocated_bytes()
-    )  # fmt: skip
+        len(list(Path("/proc/self/fd").iterdir())),
+        len(tasks),
+        children,
+        pages * os.sysconf("SC_PAGE_SIZE"),
+        allocated_bytes(),
+    )
 
 
 def one_round(folder: Path, number: int, commands: bool) -> None:

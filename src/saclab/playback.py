@@ -46,8 +46,8 @@ def evaluate(
         UserError: if the run has no policy, or its environment would import a package not named in `imports`.
         RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
     """
-    run = run.absolute()  # the environment may change the working directory
     policy, description = load_policy(run), read_description(run)
+    run = run.absolute()  # the environment may change the working directory
     require_import_allowed(description["environment"], imports)
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
     with tracebacks_in([run]):
@@ -70,10 +70,10 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
             be rendered here.
         RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
     """
-    run, given, video = run.absolute(), video, video.absolute()  # the environment may change the working directory
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     policy, description = load_policy(run), read_description(run)
+    run, given, video = run.absolute(), video, video.absolute()  # the environment may change the working directory
     require_import_allowed(description["environment"], imports)
     with tracebacks_in([run]):
         environment = filmed_environment(description["environment"], description["environment_arguments"], size)

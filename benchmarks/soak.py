@@ -39,6 +39,8 @@ from saclab.training.run_folder import find_runs
 GROWTH_BYTES = 256 * 1024
 """A round's replay buffers, learners and figures take some 100 MB: what is lost of them would be seen."""
 RESIDENT_BYTES = 3 * 2**20
+RESIDENT_ROUNDS = 12
+"""It is judged from so many rounds after the warm-up on: over fewer, one step of it is a slope."""
 LEAST_ROUNDS = 6
 SETTINGS = {
     "hidden_layers": (32, 32), "batch_size": 32, "random_steps": 100, "max_steps": 600, "replay_capacity": 20_000,
@@ -139,6 +141,8 @@ def grown(samples: Sequence[Sample]) -> dict[str, float]:
     found = {name: getattr(kept[-1], name) - getattr(kept[0], name) for name in ("descriptors", "threads", "children")}
     leaks: dict[str, float] = {name: more for name, more in found.items() if more > 0}
     for name, bound in (("allocated_bytes", GROWTH_BYTES), ("resident_bytes", RESIDENT_BYTES)):
+        if name == "resident_bytes" and len(kept) < RESIDENT_ROUNDS:
+            continue
         if (each_round := slope([getattr(each, name) for each in kept])) > bound:
             leaks[name] = each_round
     return leaks

@@ -22,6 +22,9 @@ def test_what_grows_after_the_warm_up_is_named():
     assert grown([*LEVEL[1:], Sample(12, 17, 1, 2**29, 2**28)]) == {"descriptors": 2, "children": 1}
     lost = [each._replace(allocated_bytes=2**28 + number * 2 * GROWTH_BYTES) for number, each in enumerate(LEVEL)]
     assert grown(lost) == {"allocated_bytes": 2 * GROWTH_BYTES}
+    swollen = [each._replace(resident_bytes=2**29 + number * 2**22) for number, each in enumerate(LEVEL * 3)]
+    assert grown(swollen) == {"resident_bytes": 2**22}
+    assert grown(swollen[:9]) == {}, "too few rounds to tell a slope from a step"
 
 
 def test_one_outlier_makes_no_slope():

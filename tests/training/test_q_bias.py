@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import jax
@@ -17,6 +18,7 @@ from saclab.algorithm.scalars import scalars
 from saclab.batch.loop import train_batch
 from saclab.config import Config
 from saclab.environments.checked import CheckedEnvironment
+from saclab.errors import NonFiniteError
 from saclab.protocols import make_config
 from saclab.settings import AlgorithmSettings
 from saclab.training.loop import train
@@ -78,11 +80,26 @@ class Rewriting(PendulumEnv):
         return self.seen
 
 
+class NotFinite(PendulumEnv):
+    """Its first observation is not."""
+
+    def reset(self, **options: Any) -> Any:
+        seen, info = super().reset(**options)
+        return seen * np.inf, info
+
+
+gymnasium.register("NotFinite-v0", NotFinite, max_episode_steps=200)
 gymnasium.register("Rewriting-v0", Rewriting, max_episode_steps=200)
 
 
 def test_an_environment_may_write_over_its_own_observations() -> None:
     assert pendulum_bias(0.9, 0.0, name="Rewriting-v0") == pendulum_bias(0.9, 0.0)
+
+
+def test_a_number_that_is_not_finite_is_refused() -> None:
+    """Otherwise the bias would be no number, and say nothing."""
+    with pytest.raises(NonFiniteError, match="for the Q bias of NotFinite-v0"):
+        pendulum_bias(0.9, 0.0, name="NotFinite-v0")
 
 
 def test_the_critics_are_reduced_as_the_policy_reduces_them() -> None:

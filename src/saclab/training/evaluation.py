@@ -26,6 +26,7 @@ class Evaluator:
         self.environments = [CheckedEnvironment(environment, arguments)]
         self.spec = self.environments[0].spec
 
+    @np.errstate(over="ignore")  # what is beyond 32 bits is refused as not finite
     def run(self, act: Callable[[np.ndarray], np.ndarray], seeds: Sequence[int]) -> EvaluationEpisodes:
         """One episode per seed; `act` takes observations f32[n, O] and gives actions f32[n, A] in [-1, 1].
 
@@ -39,6 +40,7 @@ class Evaluator:
         for index, seed in enumerate(seeds):
             observation[index] = self.environments[index].reset(seed)
         total_rewards, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
+        self._require_finite(observation, total_rewards)
         active = list(range(len(seeds)))
         while active:
             actions = self.spec.scale_action(act(observation[active]))

@@ -20,6 +20,7 @@ from saclab.algorithm.policy import Policy
 from saclab.algorithm.targets import reduced_q
 from saclab.config import Config
 from saclab.environments.checked import CheckedEnvironment
+from saclab.errors import NonFiniteError
 from saclab.training import seeds
 
 NEGLIGIBLE = 0.01  # weight γ^n below which what follows a cut-off state is left out
@@ -114,6 +115,7 @@ def measure_q_bias(
     return QBias(len(returns), float(q.mean()), float(returns.mean()), float(bias.mean()), float(bias.std()))
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused at the end
 def play(critics: Critics, environment: CheckedEnvironment, seed: int, generator: np.random.Generator) -> Episode:
     """One episode of the stochastic policy."""
     observation, spec = environment.reset(seed), environment.spec
@@ -127,6 +129,11 @@ def play(critics: Critics, environment: CheckedEnvironment, seed: int, generator
         rows.append((seen[0], action[0], reward, float(log_prob[0])))
         if terminated or truncated:
             break
+    if not (np.isfinite(observation).all() and all(np.isfinite([*seen, reward]).all() for seen, _, reward, _ in rows)):
+        raise NonFiniteError(
+            f"an episode for the Q bias of {environment.name} gave an observation or a reward that is not finite: "
+            "check the environment, or wrap it so that it ends the episode before it diverges"
+        )
     observations, actions, rewards, log_probs = (np.array(column) for column in zip(*rows, strict=True))
     return Episode(observations, actions, rewards, log_probs, terminated)
 

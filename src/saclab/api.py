@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -16,6 +16,7 @@ from saclab.limits import require_minutes
 from saclab.protocols import make_config
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
+from saclab.training.lock import alone_in
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
 from saclab.variants import COMPARED
 
@@ -90,6 +91,7 @@ def resume(
 def _train(config: Config, folder: Path, on_event: Callable[[Event], None], checkpoint_minutes: float) -> RunRecord:
     from saclab.training.loop import train as training_events
 
+    folder = absolute(folder)
     with requests_from_signals() as requests:
         for event in training_events(config, folder, requests, checkpoint_minutes):
             on_event(event)
@@ -131,7 +133,7 @@ def compare(
 ) -> Comparison:
     """Train every variant on every environment with every seed, in worker processes, then write the report.
 
-    Finished runs are skipped, unfinished ones resumed; a failed run does not stop the others.
+    Finished runs are skipped, unfinished ones resumed, other processes' waited for; a failed run stops no other.
 
     Args:
         environments: Gymnasium ids.
@@ -159,7 +161,7 @@ def compare(
         UserError: for a name or value that cannot work, or a missing extra; nothing has been started then.
     """
     resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
-    cells = make_grid(environments, variants, protocol, seeds, absolute(runs), environment_arguments, overrides, name)
+    cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name)
     resources.require_startable(cells)
     return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes)
 
@@ -178,19 +180,39 @@ def _compare(
         tell(note)
     with requests_from_signals() as requests:
         stream = launch(cells, resources.pool(checkpoint_minutes), requests, resources.batch)
-        statuses = (show or last)(stream)
+        statuses = (show or last)(reporting(stream, report, tell))
     return compared(statuses, report, requests.stop)
+
+
+def reporting(
+    stream: Iterable[Sequence[RunStatus]], report: Path, tell: Callable[[str], None]
+) -> Iterator[Sequence[RunStatus]]:
+    """Pass a grid's statuses on; once nothing is left but runs that hang, write the report of the others."""
+    hangs = False
+    for statuses in stream:
+        left = [status for status in statuses if status.status in ("running", "waiting")]
+        before, hangs = hangs, bool(left) and all(status.stalled for status in left)
+        if hangs and not before and (page := write_page(statuses, report)):
+            tell(f"nothing goes on but {len(left)} run(s) that hang; until they do or are stopped: report: {page}")
+        yield statuses
+
+
+def write_page(statuses: Sequence[RunStatus], report: Path) -> Path | None:
+    """Write the report of the runs that have begun, one process at a time; None if there are none."""
+    from saclab.report.report import write_report
+
+    begun = [status.cell.folder for status in statuses if (status.cell.folder / "config.json").exists()]
+    if not begun:
+        return None
+    with alone_in(report):
+        return write_report(begun, report)
 
 
 def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> Comparison:
     """What came of a grid, with its report in a folder unless the grid was interrupted."""
     failed = {status.cell.folder: status.message for status in statuses if status.status == "failed"}
     begun = [status.cell.folder for status in statuses if (status.cell.folder / "config.json").exists()]
-    page = None
-    if begun and not interrupted:
-        from saclab.report.report import write_report
-
-        page = write_report(begun, report)
+    page = None if interrupted else write_page(statuses, report)
     return Comparison([read_run(folder) for folder in begun], failed, page, interrupted)
 
 
@@ -233,7 +255,7 @@ def reproduce(
         overrides["max_updates"] = updates
     resources = chosen_resources(workers, None, batch)
     assert resources.workers is not None
-    cells = make_grid(environments, variants, "paper", seeds, absolute(runs), {}, overrides)
+    cells = make_grid(environments, variants, "paper", seeds, runs, {}, overrides)
     resources.require_startable(cells)
     left = sum(not cell.finished for cell in cells)
     if left:

@@ -1,8 +1,9 @@
-"""The errors that a user can mend. The command line prints each as one line and exits with status 2."""
+"""The errors that a user can mend, and what is said of those that an environment raises."""
 
 from __future__ import annotations
 
 import difflib
+import traceback as tracebacks
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -12,8 +13,12 @@ LONGEST_SHOWN = 200  # characters
 class UserError(Exception):
     """Something the user gave cannot work; the message names it and the way out.
 
-    Not a ValueError: the command-line parser would put those into a message of its own.
+    Not a ValueError: the command-line parser would put those into a message of its own. The command line exits with
+    status 2.
     """
+
+    traceback = ""
+    """Where an environment's own code raised an error, if that is what it is about."""
 
 
 class SettingError(UserError):
@@ -27,6 +32,9 @@ class SettingError(UserError):
 class TrainingFailed(RuntimeError):  # noqa: N818 - it names what happened
     """A run cannot go on; what it had saved is kept. The command line exits with status 1."""
 
+    traceback = ""
+    """Where an environment's own code raised an error, if that is what it is about."""
+
 
 class RunBroken(TrainingFailed):
     """Something in a run itself, its environment or an update, ends it; the others of its run group go on."""
@@ -36,7 +44,6 @@ class RunBroken(TrainingFailed):
         self.arrays = dict(arrays or {})
         """Name -> NumPy array: what is left for a look at the step."""
         self.traceback = traceback
-        """Where an environment's code raised an error, if it did."""
 
 
 class NonFiniteError(RunBroken):
@@ -56,3 +63,44 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     hint = f"did you mean {nearest[0]!r}? " if nearest else ""
     listed = ", ".join(known) if len(known) <= 60 else f"{len(known)} of them"
     return UserError(f"unknown {kind} {shown(name)}: {hint}known: {listed}")
+
+
+MESSAGE_LETTERS, LINE_LETTERS = 300, 200
+LAST_FRAMES, LAST_LINES = 2, 12
+TRACEBACK_LETTERS = 1_000_000
+
+
+def in_words(error: BaseException) -> str:
+    """The kind and the message of anybody's exception, as one line that can be printed."""
+    try:
+        said = str(error)
+    except BaseException:
+        said = "(its message cannot be told)"
+    line = " ".join(said[: 10 * MESSAGE_LETTERS].split())
+    return printable(f"{type(error).__name__}: {line}" if line else type(error).__name__, MESSAGE_LETTERS)
+
+
+def traceback_of(error: BaseException) -> str:
+    """The whole traceback of anybody's exception."""
+    try:
+        text = "".join(tracebacks.format_exception(error))
+    except BaseException:
+        text = in_words(error)
+    if len(text) > TRACEBACK_LETTERS:
+        half = TRACEBACK_LETTERS // 2
+        text = f"{text[:half]}\n…\n{text[-half:]}"
+    return text.encode(errors="backslashreplace").decode()
+
+
+def for_terminal(error: BaseException, line: str) -> str:
+    """The last lines of an environment's own code, if that is what an error is about, and one of ours."""
+    lines = getattr(error, "traceback", "").splitlines()
+    frames = [number for number, line in enumerate(lines) if line.startswith("  File ")][-LAST_FRAMES:]
+    last = lines[frames[0] if frames else 0 :][:LAST_LINES]
+    return "\n".join([*(printable(each, LINE_LETTERS) for each in last), f"saclab: {line}"])
+
+
+def printable(line: str, letters: int) -> str:
+    """A line without control characters, cut to a length."""
+    cut = line if len(line) <= letters else line[: letters - 1] + "…"
+    return "".join(letter if letter.isprintable() else "�" for letter in cut)

@@ -11,10 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saclab.environments.make import make_environment, require_import_allowed
-from saclab.errors import UserError
+from saclab.environments.checked import CheckedEnvironment
+from saclab.environments.make import require_import_allowed
+from saclab.errors import RunBroken, UserError
+from saclab.files import absolute
 from saclab.trained_policy import TrainedPolicy, load_policy, read_description
 from saclab.training.evaluation import Evaluator
+from saclab.training.failure import tell_of_closing, tracebacks_in
 
 
 class EvaluationResult(NamedTuple):
@@ -42,13 +45,18 @@ def evaluate(
 
     Raises:
         UserError: if the run has no policy, or its environment would import a package not named in `imports`.
+        RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
     """
     policy, description = load_policy(run), read_description(run)
+    run = absolute(run)
     require_import_allowed(description["environment"], imports)
-    evaluator = Evaluator(description["environment"], description["environment_arguments"])
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
-    result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
-    evaluator.close()
+    with tracebacks_in([run]):
+        evaluator = Evaluator(description["environment"], description["environment_arguments"])
+        try:
+            result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
+        finally:
+            tell_of_closing([(0, error) for error in evaluator.close()], [run])
     return EvaluationResult(
         description["environment"], episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
         result.total_rewards.tolist(), result.lengths.tolist(),
@@ -61,31 +69,43 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
     Raises:
         UserError: if the run has no policy, its environment would import a package not named in `imports`, or cannot
             be rendered here.
+        RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
+    policy, description = load_policy(run), read_description(run)
+    run, given, video = absolute(run), video, absolute(video)
+    require_import_allowed(description["environment"], imports)
+    with tracebacks_in([run]):
+        environment = filmed_environment(description["environment"], description["environment_arguments"], size)
+        try:
+            environment.reset(seed)
+            require_rendering(environment)
+            total_reward, filmed = film_to(video, environment, policy, steps, seed)
+        finally:
+            tell_of_closing([(0, error) for error in [environment.close()] if error], [run])
+    return f"{given}: {filmed} steps, return {total_reward:.1f} until then"
+
+
+def film_to(
+    video: Path, environment: CheckedEnvironment, policy: TrainedPolicy, steps: int, seed: int
+) -> tuple[float, int]:
+    """Film into a file, which is whole or not there; the return and the steps."""
     import imageio.v2 as imageio
 
-    policy, description = load_policy(run), read_description(run)
-    require_import_allowed(description["environment"], imports)
-    environment = filmed_environment(description["environment"], description["environment_arguments"], size)
-    environment.reset(seed=seed)
-    require_rendering(environment, description["environment"])
-    frames_per_second = environment.metadata.get("render_fps", 30)
+    frames_per_second = environment.environment.metadata.get("render_fps", 30)
     video.parent.mkdir(parents=True, exist_ok=True)
     partial = video.with_name(video.stem + ".partial" + video.suffix)
     try:
         with imageio.get_writer(partial, fps=frames_per_second, macro_block_size=2, quality=6) as writer:
-            total_reward, filmed = film(environment, policy, writer, steps, seed)
+            filmed = film(environment, policy, writer, steps, seed)
     except ValueError as error:
         raise UserError(f"video = {str(video)!r}: {error}; use a name that ends in .mp4") from error
-    finally:
-        environment.close()
     partial.replace(video)
-    return f"{video}: {filmed} steps, return {total_reward:.1f} until then"
+    return filmed
 
 
-def filmed_environment(name: str, arguments: Mapping[str, Any], size: int) -> Any:
+def filmed_environment(name: str, arguments: Mapping[str, Any], size: int) -> CheckedEnvironment:
     """The environment with a camera of `size` × `size` pixels, or with its own where it cannot be told one.
 
     Gymnasium's default camera stands still and the robot runs out of the picture: the one that MuJoCo's models call
@@ -93,29 +113,32 @@ def filmed_environment(name: str, arguments: Mapping[str, Any], size: int) -> An
     """
     view = {"camera_name": "track"} | dict(arguments) | {"width": size, "height": size}
     try:
-        return make_environment(name, view, render_mode="rgb_array")
+        return CheckedEnvironment(name, view, render_mode="rgb_array")
     except UserError:
-        return make_environment(name, arguments, render_mode="rgb_array")
+        return CheckedEnvironment(name, arguments, render_mode="rgb_array")
 
 
-def require_rendering(environment: Any, name: str) -> None:
+def require_rendering(environment: CheckedEnvironment) -> None:
     """Raise UserError, with what the renderer said, unless it can draw a frame."""
     try:
         frame = environment.render()
-    except Exception as error:  # renderers fail in ways of their own: a missing library, package, display or driver
-        environment.close()
-        raise UserError(
-            f"{name} cannot be filmed here: {error}; without a screen MuJoCo needs EGL (Debian: libegl1 and "
-            "libgl1-mesa-dri) and MUJOCO_GL=egl"
-        ) from error
+    except RunBroken as error:  # renderers fail in ways of their own: a missing library, package, display or driver
+        refused = UserError(
+            f"{environment.name} cannot be filmed here: {error}; without a screen MuJoCo needs EGL (Debian: libegl1 "
+            "and libgl1-mesa-dri) and MUJOCO_GL=egl"
+        )
+        refused.traceback = error.traceback
+        raise refused from error
     if not isinstance(frame, np.ndarray):
-        environment.close()
-        raise UserError(f"{name} cannot be filmed: its frames are {type(frame).__name__}, not arrays of pixels")
+        frames = type(frame).__name__
+        raise UserError(f"{environment.name} cannot be filmed: its frames are {frames}, not arrays of pixels")
 
 
-def film(environment: Any, policy: TrainedPolicy, writer: Any, steps: int, seed: int) -> tuple[float, int]:
+def film(
+    environment: CheckedEnvironment, policy: TrainedPolicy, writer: Any, steps: int, seed: int
+) -> tuple[float, int]:
     """Write one frame per step, until the episode ends or `steps` are done; the return and the steps."""
-    observation, _ = environment.reset(seed=seed)
+    observation = environment.reset(seed)
     total_reward, filmed = 0.0, 0
     while filmed < steps:
         writer.append_data(environment.render())

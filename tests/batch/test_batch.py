@@ -134,7 +134,8 @@ def make(own, how, broken_at=100):
 
 
 @pytest.mark.parametrize(
-    ("how", "words"), [("nan", "reward nan"), ("raise", "the environment raised RuntimeError: the wheels came off")]
+    ("how", "words"),
+    [("nan", "reward nan"), ("raise", "Fragile-v0 raised an error in step: RuntimeError: the wheels came off")],
 )
 def test_a_run_that_breaks_leaves_the_others_untouched(tmp_path, monkeypatch, how, words):
     with tiny_environments(monkeypatch) as prefix:

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.spaces import Box
 
 import saclab
-from saclab.errors import UserError
+from saclab.errors import RunBroken
 from saclab.training.evaluation import Evaluator
 
 
@@ -57,14 +57,14 @@ SMALL = {"hidden_layers": (8,), "batch_size": 16, "random_steps": 40, "max_steps
         ({"start": [0.0, 0.0]}, r"in reset: its observation has shape \(2,\)"),
         ({"reward": [1.0]}, r"in step: its reward has shape \(1,\)"),
         ({"reward": "much"}, "in step: its reward is .*much"),
-        ({"terminated": None}, "in step: its terminated is None and its truncated is False"),
+        ({"terminated": None}, "in step: its terminated is None, and True or False is due"),
     ],
     ids=["too short", "too long", "words", "reset", "reward of a shape", "reward in words", "flag"],
 )
 def test_what_does_not_fit_is_refused_in_training_and_in_evaluations(tmp_path, gives, words):
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(RunBroken, match=words):
         saclab.train("Unruly-v0", protocol="quick", runs=tmp_path, environment_arguments={"gives": gives}, **SMALL)
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(RunBroken, match=words):
         Evaluator("Unruly-v0", {"gives": gives}).run(lambda observation: np.zeros((len(observation), 1)), [0])
 
 

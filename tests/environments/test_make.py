@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from saclab.environments import make
 from saclab.environments.make import environment_spec, make_environment
 from saclab.errors import UserError
 
@@ -57,7 +58,7 @@ def test_arguments_reach_the_environment():
         ("HalfCheeta-v4", {}, "unknown environment 'HalfCheeta-v4': did you mean 'HalfCheetah-v4'"),
         ("halfcheetah-v4", {}, "did you mean 'HalfCheetah-v4'"),
         ("Pendulum-v9", {}, "did you mean 'Pendulum-v1'"),
-        ("Half Cheetah", {}, "environment = 'Half Cheetah': Malformed"),
+        ("Half Cheetah", {}, "environment = 'Half Cheetah': Error: Malformed"),
         ("CartPole-v1", {}, "environment = 'CartPole-v1': its actions are discrete"),
         ("Odd-v0", {"kind": "discrete action"}, "its actions are discrete"),
         ("Odd-v0", {"kind": "dict action"}, "its action space is Dict"),
@@ -79,6 +80,22 @@ def test_what_cannot_be_trained_on_is_refused_in_one_line_that_says_why(name, ar
     assert "\n" not in str(caught.value)
 
 
+def test_a_dm_control_that_does_not_know_mujoco_4_is_told_apart(tmp_path, monkeypatch):
+    """It reads a field of the model that is there no longer."""
+    (tmp_path / "dm_control").mkdir()
+    (tmp_path / "dm_control/index.py").write_text("def read(model):\n    return model.flex_vertedge\n")
+    (tmp_path / "somebodys_suite.py").write_text(
+        "import gymnasium, dm_control.index\n"
+        "gymnasium.register('Suite-v0', lambda render_mode=None: dm_control.index.read(object()))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UserError, match=r"'flex_vertedge'; this dm_control needs MuJoCo 3: pip install 'mujoco<4'"):
+        make_environment("somebodys_suite:Suite-v0")
+    monkeypatch.setattr(make, "version", lambda package: "3.17.0")
+    with pytest.raises(UserError, match=r"'flex_vertedge'$"):
+        make_environment("somebodys_suite:Suite-v0")
+
+
 def test_a_v4_environment_leaves_no_file_and_no_word_on_the_terminal(tmp_path):
     """A process of its own makes it, with a simulation that diverges, which MuJoCo warns about."""
     script = """
@@ -88,7 +105,7 @@ from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import NonFiniteError
 make_environment("HalfCheetah-v4").reset(seed=0)
 environments = TrainingEnvironments("HalfCheetah-v4", {}, [0])
-data = environments.environments[0].unwrapped.data
+data = environments.environments[0].environment.unwrapped.data
 data.qvel[:] = 1e12
 try:
     environments.step(np.zeros((1, 6), np.float32))

@@ -72,7 +72,7 @@ def test_an_ended_episode_has_its_return_and_length():
 
 def test_environments_end_their_episodes_independently():
     environments = counting(2)
-    environments.environments[1].unwrapped.terminate_at = 2
+    environments.environments[1].environment.unwrapped.terminate_at = 2
     transitions, ended = walk(environments, 5)
     assert [[e.environment for e in at_step] for at_step in ended] == [[], [1], [], [1], [0]]
     assert transitions.observation[:, 0, 1].tolist() == [0, 1, 2, 3, 4]
@@ -109,7 +109,7 @@ def test_actions_are_scaled_to_bounds_that_are_not_symmetrical():
     environments = counting(low=(-1.0, 0.0, 5.0), high=(3.0, 10.0, 6.0))
     for action in ([-1, -1, -1], [1, 1, 1], [0, 0, 0], [0.5, -0.5, 0.5]):
         environments.step(np.array([action], np.float32))
-    received = np.array(environments.environments[0].unwrapped.actions)
+    received = np.array(environments.environments[0].environment.unwrapped.actions)
     assert received.dtype == np.float32
     assert received.tolist() == [[-1, 0, 5], [3, 10, 6], [1, 5, 5.5], [2, 2.5, 5.75]]
 
@@ -124,11 +124,22 @@ def test_scaled_actions_never_leave_the_bounds_by_rounding():
     np.testing.assert_allclose(scaled, [low, high], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["i1", "u1", "i2", "i4"])
+def test_whole_numbers_reach_all_of_their_type(kind):
+    """The difference of two of them need not be one."""
+    limits = np.iinfo(kind)
+    spec = EnvironmentSpec(1, 1, np.array([limits.min], kind), np.array([limits.max], kind))
+    scaled = spec.scale_action(np.array([[-1.0], [0.0], [1.0]], np.float32))
+    assert scaled.dtype == np.dtype(kind)
+    assert scaled[[0, 2], 0].tolist() == [limits.min, limits.max]
+    assert abs(int(scaled[1, 0]) - (limits.min + limits.max) / 2) <= 0.5
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize(("broken", "message"), [("observation", r"observation entries \[1\]"), ("reward", "reward")])
 def test_a_value_that_is_not_finite_is_refused_with_its_place(broken, message, value):
     environments = counting(2)
-    environments.environments[1].unwrapped.__dict__.update(broken_at=2, broken=broken, value=value)
+    environments.environments[1].environment.unwrapped.__dict__.update(broken_at=2, broken=broken, value=value)
     walk(environments, 1)
     with pytest.raises(NonFiniteError, match=rf"Counting-v0 number 1 .*{message}.* in step 2 "):
         walk(environments, 1)

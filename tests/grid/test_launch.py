@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from saclab import memory
+from saclab.api import reporting
 from saclab.errors import SettingError, UserError
 from saclab.grid.launch import launch
 from saclab.grid.local import core_groups, local_pool
@@ -18,6 +19,7 @@ from saclab.grid.rate import RateMeter
 from saclab.grid.tasks import RunStatus
 from saclab.machine import usable_cores
 from saclab.training.common_checkpoint import checkpoint_steps
+from saclab.training.lock import InUse, holder, locked
 from saclab.training.requests import Requests
 from saclab.training.run_folder import is_finished
 from saclab.variants import VARIANTS, Variant
@@ -164,3 +166,80 @@ def test_seeds_are_counted_or_named_or_the_protocols() -> None:
         seed_numbers(0, "quick")
     with pytest.raises(UserError, match="did you mean 'quick'"):
         seed_numbers(None, "quik")
+
+
+# --- environments that harm their process, and runs of other processes
+
+
+def rogue_grid(runs: Path, *environments: str) -> list[Cell]:
+    settings = {**SETTINGS, "evaluation_interval_steps": 1000}
+    return make_grid([f"environments.rogue:{name}" for name in environments], ["sac"], "quick", 1, runs,
+                     overrides=settings)  # fmt: skip
+
+
+@pytest.fixture
+def rogues(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Workers find the environments of the tests, and say after half a second that one hangs."""
+    tests = Path(__file__).parents[1]
+    (tmp_path / "sitecustomize.py").write_text(
+        "from saclab.environments import watch\nwatch.SECONDS, watch.LOOK_SECONDS = 0.5, 0.1\n"
+    )
+    for folder in (tests, tmp_path):
+        monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("rogues")
+def test_a_run_that_hangs_or_dies_keeps_no_other_from_its_end(tmp_path: Path) -> None:
+    """One place; the report of the others is written before the end."""
+    cells = rogue_grid(tmp_path / "runs", "Hanging-v0", "Dying-v0", "Rogue-v0")
+    told: list[str] = []
+    requests = Requests()
+    for statuses in reporting(launch(cells, local_pool(1, threads=1), requests), tmp_path / "report", told.append):
+        if told and not requests.stop:
+            requests.stop = 1
+            assert [status.state for status in statuses] == ["hangs?", "failed", "finished"]
+            assert (tmp_path / "report/index.html").exists()
+            os.kill(int((cells[0].folder / "lock").read_text()), signal.SIGKILL)
+    assert "nothing goes on but 1 run(s) that hang" in told[0]
+    assert "step has taken" in statuses[0].warnings[-1]
+    assert statuses[1].message == "its worker ended (exit status 7)"
+
+
+@pytest.mark.slow
+def test_what_an_environment_prints_is_no_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]), prepend=os.pathsep)
+    (cell,) = make_grid(["environments.rogue:Meddling-v0"], ["sac"], "quick", 1, tmp_path / "runs",
+                        {"folder": str(tmp_path)}, overrides={**SETTINGS, "max_updates": 20})  # fmt: skip
+    *_, statuses = launch([cell], local_pool(1, threads=1), Requests())
+    assert [status.status for status in statuses] == ["finished"], statuses[0].message
+    assert (cell.folder / "worker.log").stat().st_size > 10**6
+
+
+@pytest.mark.slow
+def test_a_run_of_another_process_is_waited_for_and_taken_over(tmp_path: Path) -> None:
+    cells = grid(tmp_path, max_updates=100_000)
+    other, ours = launch(cells, local_pool(2, threads=1), Requests()), Requests()
+    while not all(status.updates for status in next(other)):
+        pass
+    workers = [int((cell.folder / "lock").read_text()) for cell in cells]
+    for statuses in launch(cells, local_pool(2, threads=1), ours):
+        if all(status.state == f"waits for process {worker}" for status, worker in zip(statuses, workers, strict=True)):
+            other.close()  # it saves and stops
+        if all(status.status == "running" and status.updates for status in statuses):
+            ours.stop = 1
+    assert [status.status for status in statuses] == ["interrupted"] * 2
+    assert [(cell.folder / "sessions.jsonl").read_text().count("\n") for cell in cells] == [2, 2]
+
+
+def test_who_comes_second_to_a_folder_waits(tmp_path: Path) -> None:
+    """The worker finds it locked, though the launcher found it free."""
+    status = RunStatus(grid(tmp_path)[0], "running")
+    status.enter({"event": "in_use", "message": "…"})
+    assert status.status == "waiting"
+    with locked(status.cell.folder):
+        assert holder(status.cell.folder) == str(os.getpid())
+        with pytest.raises(InUse), locked(status.cell.folder):
+            pass
+    assert holder(status.cell.folder) is None
+    assert holder(tmp_path / "nowhere") is None

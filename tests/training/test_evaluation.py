@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 from environments import tiny
 
 from saclab.environments.make import environment_spec, make_environment
+from saclab.errors import NonFiniteError
 from saclab.training.evaluation import Evaluator
 
 SEEDS = [11, 12, 13, 14]
@@ -71,4 +73,19 @@ def test_a_return_is_the_sum_of_all_rewards_up_to_the_time_limit():
 def test_evaluated_actions_are_scaled_to_the_bounds():
     evaluator = Evaluator("Counting-v0", {"low": (2.0,), "high": (6.0,)})
     evaluator.run(lambda observation: np.full((len(observation), 1), 0.5, np.float32), [1])
-    assert [action.tolist() for action in evaluator.environments[0].unwrapped.actions] == [[5.0]] * tiny.TIME_LIMIT
+    assert [action.tolist() for action in evaluator.environments[0].environment.unwrapped.actions] == [
+        [5.0]
+    ] * tiny.TIME_LIMIT
+
+
+def test_a_first_observation_that_is_not_finite_is_refused():
+    """The next one is: no step would show it."""
+
+    class First(tiny.Constant):
+        def reset(self, **options):
+            seen, info = super().reset(**options)
+            return seen * np.nan, info
+
+    gymnasium.register("First-v0", First, max_episode_steps=5)
+    with pytest.raises(NonFiniteError, match=r"evaluation episodes \[0\]"):
+        Evaluator("First-v0", {}).run(lambda observation: np.zeros((len(observation), 1), np.float32), [1])

@@ -5,16 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 
 from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import scalars
 from saclab.batch.loop import train_batch
 from saclab.config import Config
-from saclab.environments.make import environment_spec, make_environment
+from saclab.environments.checked import CheckedEnvironment
+from saclab.errors import NonFiniteError
 from saclab.protocols import make_config
 from saclab.settings import AlgorithmSettings
 from saclab.training.loop import train
@@ -45,17 +49,19 @@ def test_steps_near_a_time_limit_are_left_out() -> None:
     assert len(known_returns(episode([1.0] * 5, [0.0] * 5, terminated=True), 0.1, 0.5)) == 5
 
 
-def pendulum_bias(discount: float, shift: float, reduction: str = "minimum", critics_moved: int = 2) -> QBias:
+def pendulum_bias(
+    discount: float, shift: float, reduction: str = "minimum", critics_moved: int = 2, name: str = "Pendulum-v1"
+) -> QBias:
     """The bias of random critics, of some of which the output's bias is moved by `shift`."""
     settings = AlgorithmSettings(hidden_layers=(8,), discount=discount)
-    environment = make_environment("Pendulum-v1")
-    spec = environment_spec("Pendulum-v1", environment)
+    environment = CheckedEnvironment(name)
+    spec = environment.spec
     learner = make_learner(settings, spec.observation_size, spec.action_size)
     state = learner.init(scalars(settings, spec.action_size), jax.random.PRNGKey(0))
     critic = np.array(state.critic.weights)
     critic[:critics_moved, -1] += shift  # the last parameter is the output's bias
     critics = Critics(learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount, reduction)
-    return measure_q_bias(critics, environment, spec, [1, 2], np.random.default_rng(0))
+    return measure_q_bias(critics, environment, [1, 2], np.random.default_rng(0))
 
 
 def test_moving_q_moves_the_bias_by_as_much_over_the_mean_return() -> None:
@@ -63,6 +69,37 @@ def test_moving_q_moves_the_bias_by_as_much_over_the_mean_return() -> None:
     assert high.mean_q - low.mean_q == pytest.approx(3.0, rel=1e-4)
     assert high.mean_bias - low.mean_bias == pytest.approx(3.0 / abs(low.mean_return), rel=1e-4)
     assert high.bias_spread == pytest.approx(low.bias_spread, rel=1e-3)
+
+
+class Rewriting(PendulumEnv):
+    """Writes every observation into the same array."""
+
+    def _get_obs(self) -> np.ndarray:
+        self.seen = getattr(self, "seen", np.zeros(3, np.float32))
+        self.seen[:] = super()._get_obs()
+        return self.seen
+
+
+class NotFinite(PendulumEnv):
+    """Its first observation is not."""
+
+    def reset(self, **options: Any) -> Any:
+        seen, info = super().reset(**options)
+        return seen * np.inf, info
+
+
+gymnasium.register("NotFinite-v0", NotFinite, max_episode_steps=200)
+gymnasium.register("Rewriting-v0", Rewriting, max_episode_steps=200)
+
+
+def test_an_environment_may_write_over_its_own_observations() -> None:
+    assert pendulum_bias(0.9, 0.0, name="Rewriting-v0") == pendulum_bias(0.9, 0.0)
+
+
+def test_a_number_that_is_not_finite_is_refused() -> None:
+    """Otherwise the bias would be no number, and say nothing."""
+    with pytest.raises(NonFiniteError, match="for the Q bias of NotFinite-v0"):
+        pendulum_bias(0.9, 0.0, name="NotFinite-v0")
 
 
 def test_the_critics_are_reduced_as_the_policy_reduces_them() -> None:

@@ -154,8 +154,9 @@ class DeviceEngine:
         if self.experience is not None:
             self._launch(noise=None)
 
-    def close(self) -> None:
+    def close(self) -> Sequence[tuple[int, RunBroken]]:
         self.pool.close()
+        return []
 
     def _learner(self, run: int) -> LearnerState:
         """One run's learner; all are copied to the host once after each update."""

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from saclab.batch.builder import DeviceBuilder
 from saclab.config import Config, require_same_structure
+from saclab.files import absolute
 from saclab.machine import usable_cores
+from saclab.training.failure import tracebacks_in
 from saclab.training.loop import Told, train_runs, unfinished
 from saclab.training.process import prepare_process
 from saclab.training.requests import Requests
@@ -42,12 +44,14 @@ def train_batch(
         TrainingFailed: if no checkpoint can be written or read, or a process that steps environments has died.
     """
     require_same_structure(configs)
+    folders = [absolute(folder) for folder in folders]
     places = unfinished(configs, folders)
     if not places:
         return
     prepare_process()
-    builder = DeviceBuilder([configs[place] for place in places], slots, workers or len(usable_cores()))
     own_folders = [folders[place] for place in places]
+    with tracebacks_in(own_folders):
+        builder = DeviceBuilder([configs[place] for place in places], slots, workers or len(usable_cores()))
     with closing(train_runs(builder, own_folders, requests, checkpoint_minutes)) as told:
         for run, event in told:
             yield places[run], event

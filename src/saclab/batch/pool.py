@@ -7,6 +7,7 @@ import selectors
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -20,6 +21,7 @@ from saclab.batch.worker import DONE, MESSAGE, STEP
 from saclab.config import Config
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
+from saclab.environments.watch import log
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed, UserError
 from saclab.replay import layout_of
 from saclab.signals import how_it_ended
@@ -58,7 +60,10 @@ class EnvironmentPool:
             for worker in self.workers:
                 reply, _ = worker.receive()
                 if "user_error" in reply:
-                    raise UserError(reply["user_error"])
+                    refused = UserError(reply["user_error"])
+                    refused.traceback = reply["traceback"]
+                    raise refused
+                require_whole(reply)
         except BaseException:
             self.close()
             raise
@@ -132,6 +137,7 @@ class EnvironmentPool:
         for worker in self._owners(run):
             worker.send({"do": "capture", "run": run}, {})
             reply, arrays = worker.receive()
+            require_whole(reply)
             states += join_arrays(arrays, reply["rest"], self._example(len(reply["rest"])))
         return states
 
@@ -150,6 +156,7 @@ class EnvironmentPool:
             reply, _ = worker.receive()
             if "misfit" in reply:
                 raise EnvironmentStateError(run, reply["misfit"])
+            require_whole(reply)
             restarted += [first + index for index in reply["restarted"]]
             first = part.stop
         return restarted
@@ -182,15 +189,18 @@ class PoolWorker:
         """
         self.runs = runs
         self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - open as long as the process
+        told, self.warnings = os.pipe()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "saclab.batch.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self.errors,
             env=os.environ | {"JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-            pass_fds=[buffers.file_descriptor],
+            pass_fds=[buffers.file_descriptor, self.warnings],
             start_new_session=True,
         )
+        os.close(self.warnings)  # the process has it
+        threading.Thread(target=pass_on_warnings, args=(told,), daemon=True).start()
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.commands, self.answers = self.process.stdin.fileno(), self.process.stdout.fileno()
@@ -212,6 +222,7 @@ class PoolWorker:
             "buffers": buffers.file_descriptor,
             "configs": {run: config.to_dict() for run, config in enumerate(configs)},
             "shares": shares,
+            "warnings": self.warnings,
         }
         with self.alive():
             frames.send(self.commands, task)
@@ -270,6 +281,19 @@ class PoolWorker:
         assert self.process.stdout is not None
         self.process.stdout.close()
         self.errors.close()
+
+
+def pass_on_warnings(told: int) -> None:
+    """Log what a process says of its environments beside its answers, until it ends."""
+    with os.fdopen(told, errors="replace") as lines:
+        for line in lines:
+            log.warning(line.rstrip("\n"), extra={"stalled": True})
+
+
+def require_whole(reply: dict[str, Any]) -> None:
+    """Raise the error that a worker has described in place of an answer."""
+    if "failure" in reply:
+        raise error_of(reply["failure"], {})
 
 
 def error_of(entry: dict[str, str], arrays: Arrays) -> RunBroken:

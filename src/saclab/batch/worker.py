@@ -6,9 +6,9 @@ answers each on what was its standard output. It ends when its input does.
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
-import traceback
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +17,10 @@ from saclab.algorithm.learner import Learner
 from saclab.batch.frames import Arrays, Message, receive, send
 from saclab.batch.shared_buffers import SharedBuffers, Sizes
 from saclab.config import Config
+from saclab.environments.foreign import prints_apart
 from saclab.environments.vector import TrainingEnvironments
-from saclab.errors import NonFiniteError, RunBroken, UserError
+from saclab.environments.watch import log
+from saclab.errors import NonFiniteError, RunBroken, UserError, in_words, traceback_of
 from saclab.replay import RowLayout
 from saclab.signals import die_with
 from saclab.training.captured import join_arrays, split_arrays
@@ -56,7 +58,6 @@ class EnvironmentWorker:
             self.buffers.observation[rows] = environments.observation
         any_config = next(iter(self.configs.values()))
         self.evaluator = Evaluator(any_config.environment, any_config.environment_arguments)
-        self.spec = self.evaluator.spec
 
     def step(self) -> Message:
         """Step every active environment once; what went wrong in which run, and the numbers that belong to it."""
@@ -92,8 +93,7 @@ class EnvironmentWorker:
             case "q_bias":
                 return self.q_bias(header, arrays)
             case "capture":
-                captured, rest = split_arrays(self._share(header["run"]).environments.capture())
-                return {"rest": rest}, captured
+                return self.capture(header["run"])
             case "restore":
                 return self.restore(header, arrays)
         raise ValueError(header["do"])
@@ -121,10 +121,18 @@ class EnvironmentWorker:
         config, learner = self.configs[header["run"]], self._learner(header["run"])
         critics = critics_of(config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"])
         try:
-            bias = q_bias_at(config, critics, self.evaluator.environments[0], self.spec, header["evaluations"])
+            bias = q_bias_at(config, critics, self.evaluator.environments[0], header["evaluations"])
         except Exception as error:
             return {"failure": described(error)}, {}
         return {"bias": list(bias)}, {}
+
+    def capture(self, run: int) -> Message:
+        """The exact states of one run's environments."""
+        try:
+            captured, rest = split_arrays(self._share(run).environments.capture())
+        except Exception as error:
+            return {"failure": described(error)}, {}
+        return {"rest": rest}, captured
 
     def restore(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """Continue the episodes; which environments started anew instead, or why the states do not fit."""
@@ -134,6 +142,8 @@ class EnvironmentWorker:
             restarted = share.environments.restore(states, header["seeds"])
         except (KeyError, OverflowError, TypeError, ValueError) as error:
             return {"misfit": str(error)}, {}
+        except RunBroken as error:
+            return {"failure": described(error)}, {}
         self.buffers.observation[share.rows] = share.environments.observation
         return {"restarted": restarted}, {}
 
@@ -150,21 +160,28 @@ def described(error: Exception) -> dict[str, str]:
         return {"not_finite": str(error)}
     known = isinstance(error, RunBroken | UserError)
     return {
-        "broken": str(error) if known else f"{type(error).__name__}: {error}",
-        "traceback": error.traceback if isinstance(error, RunBroken) else "".join(traceback.format_exception(error)),
+        "broken": str(error) if known else in_words(error),
+        "traceback": error.traceback if isinstance(error, RunBroken) else traceback_of(error),
     }
 
 
 def main() -> None:
     """Answer until the input ends."""
-    commands, answers = os.dup(0), os.dup(1)
-    os.dup2(2, 1)  # what an environment prints must not end up among the answers
-    task, _ = receive(commands)
+    with prints_apart() as answers:
+        answer_all(os.dup(0), answers)
+
+
+def answer_all(commands: int, answers: int) -> None:
+    task = receive(commands)[0]
     die_with(task["engine"])
+    log.addHandler(logging.StreamHandler(os.fdopen(task["warnings"], "w")))
     try:
         worker = EnvironmentWorker(task)
     except UserError as error:
-        send(answers, {"user_error": str(error)})
+        send(answers, {"user_error": str(error), "traceback": error.traceback})
+        return
+    except RunBroken as error:
+        send(answers, {"failure": described(error)})
         return
     send(answers, {})
     while command := os.read(commands, 1):

@@ -46,7 +46,7 @@ def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[event
             match event:
                 case events.Started():
                     where = f"resumed at step {event.resumed_at_step}" if event.resumed_at_step else "started"
-                    console.print(f"{escape(str(event.run))} {where}")
+                    console.print(f"{escape(str(event.run))} {where}", soft_wrap=True)
                     for note in event.notes:
                         console.print(f"  {escape(note)}", soft_wrap=True)
                 case events.Progress():
@@ -80,19 +80,26 @@ def show_run(stream: Iterable[events.Event], console: Console) -> Iterator[event
 def show_grid(stream: Iterable[Sequence[RunStatus]], console: Console) -> list[RunStatus]:
     """Show a grid of runs until its end; the last statuses."""
     statuses: Sequence[RunStatus] = ()
+    told: dict[int, int] = {}
     last_line = 0.0
     with Live(console=console, refresh_per_second=4, transient=True, auto_refresh=console.is_terminal) as live:
         for statuses in stream:
+            tell_warnings(statuses, told, console)
             if console.is_terminal:
                 live.update(grid_table(statuses, rows=max(5, console.height - 6)))
             elif time.monotonic() - last_line > PLAIN_SECONDS:
                 last_line = time.monotonic()
                 console.print(grid_line(statuses), soft_wrap=True)
     console.print(grid_table(statuses, rows=len(statuses)))
-    for status in statuses:
-        for warning in status.warnings:
-            console.print(f"warning: {run_name(status)}: {warning}", markup=False, soft_wrap=True)
     return list(statuses)
+
+
+def tell_warnings(statuses: Sequence[RunStatus], told: dict[int, int], console: Console) -> None:
+    """Say what has been warned of since the last time; `told` is place -> how many were told."""
+    for place, status in enumerate(statuses):
+        for warning in status.warnings[told.get(place, 0) :]:
+            console.print(f"warning: {run_name(status)}: {warning}", markup=False, soft_wrap=True)
+        told[place] = len(status.warnings)
 
 
 def run_name(status: RunStatus) -> str:
@@ -110,6 +117,7 @@ def grid_line(statuses: Sequence[RunStatus]) -> str:
         for status in statuses
         if status.status == "running"
     ]
+    running += [f"{run_name(status)}: {status.state}, which trains it" for status in statuses if status.elsewhere]
     return escape(f"{finished} of {len(statuses)} runs finished | " + " | ".join(running))
 
 
@@ -124,7 +132,7 @@ def grid_table(statuses: Sequence[RunStatus], rows: int) -> Table:
     colours = {"failed": "red", "running": "cyan", "finished": "green"}
     for status in shown:
         table.add_row(
-            escape(run_name(status)), f"[{colours.get(status.status, 'default')}]{status.status}[/]",
+            escape(run_name(status)), f"[{colours.get(status.status, 'default')}]{status.state}[/]",
             f"{status.fraction:.0%}", f"{status.meter.updates_per_second:.0f}", duration(status.meter.seconds_left),
             number(status.evaluation_return),
         )  # fmt: skip

@@ -13,6 +13,7 @@ from saclab.cli.results import Evaluate, Protocols, Record, Report, Variants
 from saclab.cli.settings import with_absolute_paths, with_settings
 from saclab.cli.streams import output_lost, use_lasting_streams
 from saclab.cli.training import Compare, Reproduce, Resume, Train
+from saclab.errors import for_terminal
 from saclab.exits import EXIT_FAILED, end_after
 
 
@@ -30,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status = end.code if isinstance(end.code, int) else EXIT_FAILED if end.code else 0
     except BaseException as error:
         status, line = end_after(error)
-        print(f"saclab: {line}", file=sys.stderr)
+        print(for_terminal(error, line), file=sys.stderr)
     return status or (EXIT_FAILED if output_lost() else 0)
 
 

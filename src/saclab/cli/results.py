@@ -39,10 +39,12 @@ class Evaluate:
 
     def __call__(self, console: Console) -> int:
         from saclab import playback
+        from saclab.environments.foreign import prints_apart
 
         if self.episodes < 1:
             raise SettingError("episodes", self.episodes, "use at least 1")
-        result = playback.evaluate(self.run, self.episodes, self.seed, not self.stochastic, self.imports)
+        with prints_apart():  # what is told is alone on standard output
+            result = playback.evaluate(self.run, self.episodes, self.seed, not self.stochastic, self.imports)
         console.print(json.dumps(result._asdict()) if self.json else result.sentence(), soft_wrap=True, highlight=False)
         return 0
 

@@ -1,89 +1,155 @@
-"""What an environment gives, held against what it has declared: it is anybody's code.
+"""An environment as the rest of saclab knows it: all that it gives is held against what it has declared.
 
 Every step of a training goes through here, so the way of an environment that keeps its word is a short one.
 """
 
 from __future__ import annotations
 
-import traceback
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
-import gymnasium
 import numpy as np
 
-from saclab.errors import RunBroken, UserError
+from saclab.environments.foreign import Calls, signals_kept
+from saclab.environments.make import make_with_spec
+from saclab.environments.simulator import State, capture_state, restore_state
+from saclab.errors import RunBroken, in_words
 
 Step = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
-"""Observation [O] of any real type, reward, terminated, truncated, info."""
-FLAGS = (bool, np.bool_, int)
+"""Observation [O] of real numbers, reward, terminated, truncated, info."""
+NUMBERS = "fiub"
+"""Kinds of NumPy's types that are real numbers."""
 
 
-def checked_reset(environment: gymnasium.Env[Any, Any], size: int, seed: int | None) -> np.ndarray:
-    """Start an episode: the first observation [size].
+class CheckedEnvironment:
+    """A Gymnasium environment that is anybody's code.
 
-    Raises:
-        UserError: if that is not what `reset` gives.
-        RunBroken: if the environment raises an error.
+    Whatever its methods raise is a RunBroken with the environment's own traceback, and so is what is not what a
+    Gymnasium environment gives.
     """
+
+    def __init__(self, name: str, arguments: Mapping[str, Any] | None = None, render_mode: str | None = None) -> None:
+        """Make it.
+
+        Raises:
+            UserError: if it cannot be made or trained on.
+        """
+        self.name = name
+        self.calls = Calls(name)
+        self.environment, self.spec = make_with_spec(self.calls, name, arguments, render_mode)
+        self.shape = (self.spec.observation_size,)
+
+    def reset(self, seed: int | None) -> np.ndarray:
+        """Start an episode: the first observation [O], as `step` gives it."""
+        with signals_kept():
+            given = self.calls("reset", self.environment.reset, seed=seed)
+        if not isinstance(given, tuple) or len(given) != 2:
+            self.refuse("reset", f"it returned {type(given).__name__}", "a pair (observation, info)")
+        return self._observation("reset", given[0])
+
+    def step(self, action: np.ndarray) -> Step:
+        """Take a step with an action within the environment's bounds.
+
+        Returns:
+            The observation may be an array that the environment writes its next one into: who keeps it copies it.
+        """
+        given = self.calls("step", self.environment.step, action)
+        if not isinstance(given, tuple) or len(given) != 5:
+            what = f"{len(given)} values" if isinstance(given, tuple) else type(given).__name__
+            self.refuse("step", f"it returned {what}", "(observation, reward, terminated, truncated, info)")
+        seen, reward, ends, cut, info = given
+        if type(seen) is not np.ndarray or seen.shape != self.shape or seen.dtype.char not in "df":
+            seen = self._observation("step", seen)
+        if type(reward) is not float:
+            reward = float(reward) if isinstance(reward, float) else self._reward(reward)
+        if ends is not True and ends is not False:
+            ends = self._flag("terminated", ends)
+        if cut is not True and cut is not False:
+            cut = self._flag("truncated", cut)
+        if not isinstance(info, dict):
+            self.refuse("step", f"its info is {type(info).__name__}", "a dict")
+        return seen, reward, ends, cut, info
+
+    def capture(self) -> State | None:
+        """The exact state of its episode; None if it cannot be captured."""
+        state: State | None = self.calls("saclab_capture", capture_state, self.environment)
+        if state is not None and not is_named_arrays(state["physics"]):
+            self.refuse("saclab_capture", "it returned something else", "a dict of names and arrays of numbers")
+        return state
+
+    def restore(self, state: State) -> None:
+        """Continue an episode from `capture` in an environment that has been reset once.
+
+        Raises:
+            KeyError, TypeError, ValueError or OverflowError: if it is no state of this kind of environment.
+        """
+        try:
+            self.calls.run("saclab_restore", restore_state, self.environment, state)
+        except (KeyError, OverflowError, TypeError, ValueError):
+            raise
+        except Exception as error:
+            raise self.calls.raised("saclab_restore", error) from error
+
+    def render(self) -> Any:
+        """What it draws."""
+        return self.calls("render", self.environment.render)
+
+    def close(self) -> RunBroken | None:
+        """Close it; what went wrong then, which harms no result."""
+        try:
+            with signals_kept():
+                self.calls("close", self.environment.close)
+        except RunBroken as error:
+            return error
+        return None
+
+    def refuse(self, call: str, what: str, expected: str) -> NoReturn:
+        raise RunBroken(
+            f"environment {self.name} breaks its own word in {call}: {what}, and {expected} is due: mend it there"
+        )
+
+    def _observation(self, call: str, given: Any) -> np.ndarray:
+        try:
+            seen: np.ndarray = np.asarray(given)
+        except Exception as error:
+            self.refuse(call, f"its observation is no array ({in_words(error)})", "an array of real numbers")
+        if seen.shape != self.shape:
+            declared = f"shape {self.shape}, as its observation space says,"
+            self.refuse(call, f"its observation has shape {seen.shape}", declared)
+        if seen.dtype.kind not in NUMBERS or np.ma.is_masked(given):
+            masked = " with masked entries" if np.ma.is_masked(given) else ""
+            self.refuse(call, f"its observation has type {seen.dtype}{masked}", "an array of real numbers")
+        return seen
+
+    def _reward(self, given: Any) -> float:
+        try:
+            kind = np.asarray(given).dtype.kind
+            if np.ndim(given) == 0 and kind in NUMBERS + "O":
+                return float(given)
+        except Exception:
+            kind = "O"
+        shape = np.shape(given) if kind in NUMBERS else ()
+        what = f"has shape {shape}" if shape else f"is {shortly(given)}"
+        self.refuse("step", f"its reward {what}", "a single number")
+
+    def _flag(self, name: str, given: Any) -> bool:
+        if type(given) in (np.bool_, int) and given in (0, 1):
+            return bool(given)
+        self.refuse("step", f"its {name} is {shortly(given)}", "True or False")
+
+
+def is_named_arrays(given: Any) -> bool:
+    """Whether it can be kept in a checkpoint."""
+    return isinstance(given, dict) and all(
+        isinstance(name, str) and isinstance(array, np.ndarray) and array.dtype.kind in NUMBERS and array.itemsize <= 8
+        for name, array in given.items()
+    )
+
+
+def shortly(given: Any) -> str:
+    """A value as one short line."""
     try:
-        given = environment.reset(seed=seed)
-    except Exception as error:
-        raise raised(error) from error
-    if not isinstance(given, tuple) or len(given) != 2:
-        refuse(environment, "reset", f"it returned {type(given).__name__}", "a pair (observation, info)")
-    return checked_observation(environment, "reset", given[0], size)
-
-
-def checked_step(environment: gymnasium.Env[Any, Any], action: np.ndarray, size: int) -> Step:
-    """Take a step, whose observation is [size].
-
-    Raises:
-        UserError: if what it gave is not what a Gymnasium environment gives.
-        RunBroken: if the environment raises an error.
-    """
-    try:
-        given = environment.step(action)
-    except Exception as error:
-        raise raised(error) from error
-    if type(given) is not tuple or len(given) != 5:
-        what = f"{len(given)} values" if isinstance(given, tuple) else type(given).__name__
-        refuse(environment, "step", f"it returned {what}", "(observation, reward, terminated, truncated, info)")
-    seen, reward, terminated, truncated, info = given
-    if type(seen) is not np.ndarray or seen.shape != (size,) or seen.dtype.char not in "df":
-        seen = checked_observation(environment, "step", seen, size)
-    if type(reward) is not float:
-        reward = checked_reward(environment, reward)
-    if type(terminated) not in FLAGS or type(truncated) not in FLAGS:
-        flags = f"its terminated is {terminated!r} and its truncated is {truncated!r}"
-        refuse(environment, "step", flags, "True or False for each")
-    return seen, reward, bool(terminated), bool(truncated), info
-
-
-def checked_observation(environment: gymnasium.Env[Any, Any], call: str, given: Any, size: int) -> np.ndarray:
-    seen: np.ndarray = given if isinstance(given, np.ndarray) else np.asarray(given)
-    if seen.shape != (size,):
-        declared = f"shape ({size},), as its observation space says,"
-        refuse(environment, call, f"its observation has shape {seen.shape}", declared)
-    if seen.dtype.kind not in "fiub":
-        refuse(environment, call, f"its observation has type {seen.dtype}", "an array of real numbers")
-    return seen
-
-
-def checked_reward(environment: gymnasium.Env[Any, Any], reward: Any) -> float:
-    if isinstance(reward, np.ndarray) and reward.ndim:
-        refuse(environment, "step", f"its reward has shape {reward.shape}", "a single number")
-    try:
-        return float(reward)
-    except (TypeError, ValueError):
-        refuse(environment, "step", f"its reward is {reward!r}", "a single number")
-
-
-def refuse(environment: gymnasium.Env[Any, Any], call: str, what: str, expected: str) -> NoReturn:
-    name = environment.spec.id if environment.spec is not None else type(environment.unwrapped).__name__
-    raise UserError(f"environment {name} breaks its own word in {call}: {what}, and {expected} is due: mend it there")
-
-
-def raised(error: Exception) -> RunBroken:
-    """What a run is told of an error in its environment's own code."""
-    words = "".join(traceback.format_exception(error))
-    return RunBroken(f"the environment raised {type(error).__name__}: {error}", traceback=words)
+        said = repr(given)
+    except Exception:
+        said = f"a {type(given).__name__}"
+    return " ".join(said[:200].split())

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import logging
+import traceback
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 
-from saclab.errors import SettingError, UserError, unknown_name
+from saclab.environments.foreign import Calls, meant_for_saclab, signals_kept
+from saclab.errors import SettingError, UserError, in_words, traceback_of, unknown_name
 from saclab.variants import task_name
+
+ENDS = np.array([-1.0, 0.0, 1.0], np.float32)
+LARGEST_INTEGER = 2**53  # up to it, 64-bit floats are exact
 
 
 @dataclass(frozen=True)
@@ -39,32 +45,42 @@ class EnvironmentSpec:
 
     @cached_property
     def _middle_and_half_range(self) -> tuple[np.ndarray, np.ndarray]:
-        return (self.action_high + self.action_low) / 2, (self.action_high - self.action_low) / 2
+        low, high = self.action_low, self.action_high
+        if low.dtype.kind != "f":  # the difference of two int8 need not be one
+            low, high = low.astype(np.float64), high.astype(np.float64)
+        return (high + low) / 2, (high - low) / 2
 
 
 def make_environment(
     environment: str, arguments: Mapping[str, Any] | None = None, render_mode: str | None = None
 ) -> gymnasium.Env[np.ndarray, np.ndarray]:
-    """The environment, checked to be one that saclab can train on.
+    """The environment, as `make_with_spec` makes it."""
+    return make_with_spec(Calls(environment), environment, arguments, render_mode)[0]
+
+
+def make_with_spec(
+    calls: Calls, environment: str, arguments: Mapping[str, Any] | None, render_mode: str | None
+) -> tuple[gymnasium.Env[np.ndarray, np.ndarray], EnvironmentSpec]:
+    """The environment, checked to be one that saclab can train on; `calls` are those into its code.
 
     Raises:
-        UserError: for an unknown id, wrong arguments, a missing dependency, or spaces other than flat Boxes with
-            finite action bounds.
+        UserError: for an unknown id, wrong arguments, a missing dependency, an error of its own, or spaces other than
+            flat Boxes with finite action bounds.
     """
     arguments = dict(arguments or {})
     if render_mode is not None:
         arguments["render_mode"] = render_mode
     quiet_simulator()
-    with warnings.catch_warnings(), making(environment, arguments):
+    with warnings.catch_warnings(), signals_kept(), making(environment, arguments):
         warnings.simplefilter("ignore")  # v4 environments are here on purpose: no deprecation notices
-        made = gymnasium.make(environment, disable_env_checker=True, **arguments)
-    try:
-        require_version(environment, made)
-        environment_spec(environment, made)
-    except UserError:
-        made.close()
-        raise
-    return made
+        made = calls.run("__init__", gymnasium.make, environment, disable_env_checker=True, **arguments)
+        try:
+            require_version(environment, made)
+            return made, environment_spec(environment, made)
+        except BaseException:
+            with suppress(Exception):
+                calls.run("close", made.close)
+            raise
 
 
 def require_import_allowed(environment: str, imports: Sequence[str]) -> None:
@@ -90,12 +106,39 @@ def making(environment: str, arguments: Mapping[str, Any]) -> Iterator[None]:
     except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound,
             gymnasium.error.DeprecatedEnv, gymnasium.error.UnregisteredEnv) as error:  # fmt: skip
         raise unknown_environment(environment) from error
-    except (TypeError, OSError) as error:
-        raise SettingError(
-            "environment_arguments", dict(arguments), f"{environment} does not accept them ({error})"
-        ) from error
     except (gymnasium.error.Error, ImportError) as error:
-        raise UserError(f"environment = {environment!r}: {error}") from error
+        raise UserError(f"environment = {environment!r}: {in_words(error)}") from error
+    except UserError:
+        raise
+    except BaseException as error:
+        if meant_for_saclab(error):
+            raise
+        raise not_made(environment, arguments, error) from error
+
+
+def not_made(environment: str, arguments: Mapping[str, Any], error: BaseException) -> UserError:
+    """What is said of an error that came up while an environment was made."""
+    refused: UserError
+    if arguments and isinstance(error, TypeError | OSError):
+        way_out = f"{environment} does not accept them ({in_words(error)})"
+        refused = SettingError("environment_arguments", dict(arguments), way_out)
+    else:
+        advice = "" if not ahead_of_dm_control(error) else "; this dm_control needs MuJoCo 3: pip install 'mujoco<4'"
+        refused = UserError(f"environment = {environment!r}: it raised an error in __init__: {in_words(error)}{advice}")
+    first = error
+    while first.__cause__ is not None:
+        first = first.__cause__
+    last = list(traceback.walk_tb(first.__traceback__))[-1][0]
+    if last.f_globals.get("__name__") != gymnasium.make.__module__:  # which calls it: the arguments are not its own
+        refused.traceback = traceback_of(first)
+    return refused
+
+
+def ahead_of_dm_control(error: BaseException) -> bool:
+    """Whether it comes of a dm_control that reads a field which MuJoCo 4 has no longer (1.0.50 is one)."""
+    modules = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+    named = any(str(module).startswith("dm_control.") for module in modules)
+    return named and isinstance(error, AttributeError) and int(version("mujoco").partition(".")[0]) >= 4
 
 
 def require_version(name: str, environment: gymnasium.Env[Any, Any]) -> None:
@@ -125,13 +168,34 @@ def environment_spec(name: str, environment: gymnasium.Env[Any, Any]) -> Environ
         )  # fmt: skip
     if not isinstance(action, Box) or len(action.shape) != 1:
         raise SettingError("environment", name, f"its action space is {action}, and a Box of one dimension is needed")
+    if 0 in observation.shape + action.shape:
+        raise SettingError(
+            "environment", name, f"there is nothing to see or to do in it: its spaces are {observation} and {action}"
+        )
     if not (np.isfinite(action.low).all() and np.isfinite(action.high).all()):
         raise SettingError(
             "environment", name,
             f"its action bounds are infinite (low {action.low}, high {action.high}), and actions are scaled to the "
             "bounds: wrap it in gymnasium.wrappers.RescaleAction or register it with finite bounds",
         )  # fmt: skip
-    return EnvironmentSpec(observation.shape[0], action.shape[0], action.low, action.high)
+    spec = EnvironmentSpec(observation.shape[0], action.shape[0], action.low.copy(), action.high.copy())
+    require_usable_bounds(name, spec)
+    return spec
+
+
+def require_usable_bounds(name: str, spec: EnvironmentSpec) -> None:
+    """Refuse bounds between which actions cannot be scaled exactly."""
+    low, high = spec.action_low, spec.action_high
+    with np.errstate(over="ignore"):
+        usable = low.dtype.kind in "fiu" and (low <= high).all() and np.isfinite(spec.scale_action(ENDS[:, None])).all()
+    if low.dtype.kind in "iu":
+        usable = usable and max(-int(low.min()), int(high.max())) <= LARGEST_INTEGER
+    if not usable:
+        raise SettingError(
+            "environment", name,
+            f"actions cannot be scaled to its action bounds (low {low}, high {high}, of type {low.dtype}): wrap it in "
+            "gymnasium.wrappers.RescaleAction or register it with closer ones",
+        )  # fmt: skip
 
 
 def unknown_environment(environment: str) -> UserError:

@@ -7,11 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saclab.environments.checked import checked_reset, checked_step
-from saclab.environments.make import environment_spec, make_environment
+from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.reward_terms import split_reward
-from saclab.environments.simulator import capture_state, restore_state
-from saclab.errors import NonFiniteError
+from saclab.errors import NonFiniteError, RunBroken
 
 
 class Transitions(NamedTuple):
@@ -52,8 +50,8 @@ class TrainingEnvironments:
         """
         self.reward_terms = tuple(reward_terms)
         self.name = environment
-        self.environments = [make_environment(environment, arguments) for _ in seeds]
-        self.spec = environment_spec(environment, self.environments[0])
+        self.environments = [CheckedEnvironment(environment, arguments) for _ in seeds]
+        self.spec = self.environments[0].spec
         self.observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
         """f32[N, O]: the current observations."""
         self.total_rewards = np.zeros(len(seeds), np.float64)
@@ -69,15 +67,20 @@ class TrainingEnvironments:
 
         Raises:
             NonFiniteError: if an environment gives an observation or a reward that is not finite.
+            RunBroken: if one breaks its word or raises an error.
         """
+        with np.errstate(over="ignore"):  # what is beyond 32 bits is refused as not finite
+            return self._step(action)
+
+    def _step(self, action: np.ndarray) -> tuple[Transitions, list[EndedEpisode]]:
         observation = self.observation.copy()
         reward_terms = np.zeros((len(self), len(self.reward_terms) + 1), np.float32)
         next_observation = np.empty_like(observation)
         terminated = np.zeros(len(self), bool)
         ended = []
-        scaled, size = self.spec.scale_action(action), self.spec.observation_size
+        scaled = self.spec.scale_action(action)
         for index, environment in enumerate(self.environments):
-            seen, reward, ends, cut, info = checked_step(environment, scaled[index], size)
+            seen, reward, ends, cut, info = environment.step(scaled[index])
             next_observation[index], reward_terms[index, -1], terminated[index] = seen, reward, ends
             self._require_finite(index, next_observation[index], float(reward_terms[index, -1]), scaled[index])
             if self.reward_terms:
@@ -91,15 +94,15 @@ class TrainingEnvironments:
                 self.observation[index] = seen
         return Transitions(observation, action, reward_terms, next_observation, terminated), ended
 
-    def close(self) -> None:
-        for environment in self.environments:
-            environment.close()
+    def close(self) -> list[RunBroken]:
+        """Close them; what went wrong then, which harms no result."""
+        return [error for environment in self.environments if (error := environment.close())]
 
     def capture(self) -> list[dict[str, Any] | None]:
         """The exact state of each environment and its episode so far; None where it cannot be captured."""
         states: list[dict[str, Any] | None] = []
         for index, environment in enumerate(self.environments):
-            state = capture_state(environment)
+            state = environment.capture()
             if state is not None:
                 state["observation"] = self.observation[index].copy()
                 state["total_reward"] = float(self.total_rewards[index])
@@ -118,7 +121,7 @@ class TrainingEnvironments:
                 restarted.append(index)
                 self._start_episode(index, seed=seeds[index])
                 continue
-            restore_state(environment, state)
+            environment.restore(state)
             self.observation[index] = state["observation"]
             self.total_rewards[index] = state["total_reward"]
             self.lengths[index] = state["length"]
@@ -128,8 +131,7 @@ class TrainingEnvironments:
         return EndedEpisode(index, float(self.total_rewards[index]), int(self.lengths[index]), terminated)
 
     def _start_episode(self, index: int, seed: int | None = None) -> None:
-        size = self.spec.observation_size
-        self.observation[index] = checked_reset(self.environments[index], size, seed)
+        self.observation[index] = self.environments[index].reset(seed)
         self.total_rewards[index], self.lengths[index] = 0.0, 0
         self._require_finite(index, self.observation[index], 0.0, np.zeros(0, np.float32))
 

@@ -13,6 +13,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
 from saclab.config import Config
+from saclab.environments.foreign import prints_apart
 from saclab.errors import TrainingFailed
 from saclab.exits import end_after
 from saclab.grid.plan import Cell
@@ -156,19 +157,19 @@ def endless(config: Config) -> Config:
 
 def main() -> int:
     """Measure what standard input says; the exit status."""
-    task, answer = json.load(sys.stdin), os.dup(1)
-    os.dup2(2, 1)  # what an environment prints must not end up in the answer
+    task = json.load(sys.stdin)
     die_with(task["parent"])
     kinds = [
         Kind(tuple(Config.from_dict(config) for config in configs), slots, workers)
         for configs, slots, workers in task["kinds"]
     ]
-    try:
-        os.write(answer, json.dumps([measure(kind) for kind in kinds]).encode())
-    except Exception as error:
-        status, line = end_after(error)
-        print(line, file=sys.stderr)
-        return status
+    with prints_apart() as answers:
+        try:
+            os.write(answers, json.dumps([measure(kind) for kind in kinds]).encode())
+        except Exception as error:
+            status, line = end_after(error)
+            print(line, file=sys.stderr)
+            return status
     return 0
 
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from saclab.grid.plan import Cell
-from saclab.grid.pool import End, WorkerPool
+from saclab.grid.pool import POLL_SECONDS, End, WorkerPool
 from saclab.grid.tasks import RunStatus, Task, make_statuses, make_tasks
 from saclab.signals import how_it_ended
 from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.requests import Requests
 
+LOOK_SECONDS = 1.0  # between two looks at the runs of other processes
 LOSSES = 3  # of a run's worker without a new checkpoint in between; one more, and the run has failed
 
 
@@ -23,7 +25,8 @@ def launch(
 ) -> Iterator[list[RunStatus]]:
     """Train every unfinished cell; yields all statuses several times a second.
 
-    A failed run does not stop the others. When `requests.stop` is set, every worker saves its runs and stops; at the
+    A failed run does not stop the others. A run that another process trains is waited for; if that process ends before
+    the run does, it goes on here. When `requests.stop` is set, every worker saves its runs and stops; at the
     end no worker is left behind, however this generator ends.
 
     Args:
@@ -60,6 +63,9 @@ class Grid:
     losses: dict[Path, tuple[int, int]] = field(default_factory=dict)
     """Run folder -> workers lost since its newest checkpoint, and that one's step."""
     stopping: bool = False
+    elsewhere: bool = False
+    """Whether a task waits for another process."""
+    next_look: float = 0.0
 
     def note(self) -> None:
         """Let the waiting runs say what the pool has to say of them."""
@@ -69,11 +75,27 @@ class Grid:
 
     def start(self) -> None:
         """Hand waiting tasks to the pool, as far as it has places."""
-        while self.waiting and (self.pool.places is None or len(self.running) < self.pool.places):
-            task = self.waiting.pop(0)
+        if self.elsewhere and time.monotonic() < self.next_look:
+            return
+        self.next_look = time.monotonic() + LOOK_SECONDS
+        self.elsewhere = False
+        for task in tuple(self.waiting):
+            if self.pool.places is not None and self.busy >= self.pool.places:
+                return
+            if task.found_elsewhere():
+                self.elsewhere = True
+                continue
+            self.waiting.remove(task)
+            if all(run.status == "finished" for run in task.runs):
+                continue
             self.running.append(task)
             if self.pool.start(task):
                 task.start()
+
+    @property
+    def busy(self) -> int:
+        """Places that are taken: a task that hangs leaves its own to another."""
+        return sum(not task.stalled for task in self.running)
 
     def stop(self) -> None:
         """Let every worker save and stop, and take back the tasks that wait for room."""
@@ -84,6 +106,8 @@ class Grid:
 
     def listen(self) -> None:
         """Take in what the workers say, and how they end."""
+        if not self.running:
+            time.sleep(POLL_SECONDS)
         for task, messages, end in self.pool.poll():
             lost = end is not None and end.code is None
             if not (task.started or lost):
@@ -104,6 +128,7 @@ class Grid:
             self._lost(task, how_it_ended(end.code, end.words))
             return
         task.ended(end.code, self.stopping, end.words)
+        self.waiting[:0] = make_tasks(task.runs, self.batch)  # those of which another process was faster
         if replaced and any(run.status in ("running", "interrupted") for run in task.runs):
             self._lost(task, "told to stop")
 

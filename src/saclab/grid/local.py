@@ -56,7 +56,7 @@ class LocalPool:
         """File descriptor of what a worker says -> the worker."""
 
     def start(self, task: Task) -> bool:
-        cores = self.free_cores.pop(0)
+        cores = self.free_cores.pop(0) if self.free_cores else []  # none is left by those that hang
         told = task.to_dict(self.checkpoint_minutes, cores, self.environment_workers)
         process = WorkerProcess(told, thread_limits(self.threads))
         self.workers[process.output.fileno()] = Worker(task, process, cores)

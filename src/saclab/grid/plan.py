@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from saclab.config import Config
-from saclab.files import same_directory
+from saclab.files import absolute, same_directory
 from saclab.protocols import make_config, protocol_row
 from saclab.settings import require
 from saclab.training.run_folder import is_finished, run_path
@@ -67,7 +67,7 @@ def make_grid(
         for environment in dict.fromkeys(environments)
         for variant in variants
     ]
-    return [Cell(config, run_path(Path(runs), config, name)) for config in configs]
+    return [Cell(config, run_path(absolute(runs), config, name)) for config in configs]
 
 
 def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 0) -> Sequence[int]:
@@ -100,7 +100,7 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
         at_once: runs that this machine's memory must hold together; 0 if they are trained elsewhere.
         fewer: the option that would lower their number.
     """
-    from saclab.environments.make import environment_spec, make_environment
+    from saclab.environments.checked import CheckedEnvironment
     from saclab.memory import needed_memory, require_memory
     from saclab.replay import layout_of
     from saclab.training.starts import require_same_config
@@ -113,8 +113,8 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
             require_same_config(cell.folder, config)
         key = config.environment, json.dumps(config.environment_arguments, sort_keys=True, default=repr)
         if key not in specs:
-            environment = make_environment(config.environment, config.environment_arguments)
-            specs[key] = environment_spec(config.environment, environment)
+            environment = CheckedEnvironment(config.environment, config.environment_arguments)
+            specs[key] = environment.spec
             environment.close()
         layout = layout_of(specs[key], config.algorithm)
         needed[sum(needed_memory(config, layout))] = config, layout

@@ -12,6 +12,7 @@ from saclab.grid.groups import run_groups
 from saclab.grid.plan import Cell
 from saclab.grid.rate import RateMeter
 from saclab.signals import EXIT_STATUS, how_it_ended
+from saclab.training.lock import holder
 
 Status = Literal["waiting", "running", "finished", "interrupted", "failed"]
 
@@ -30,22 +31,36 @@ class RunStatus:
     """Why it failed."""
     warnings: list[str] = field(default_factory=list)
     """What the run said of itself that the user should know."""
+    stalled: bool = False
+    """Whether its environment has not come back for long: it may hang."""
+    elsewhere: str = ""
+    """The id of another process that trains it, for whose end it waits."""
     meter: RateMeter = field(default_factory=RateMeter, repr=False)
+
+    @property
+    def state(self) -> str:
+        """The status in words."""
+        if self.elsewhere:
+            return f"waits for process {self.elsewhere}"
+        return "hangs?" if self.stalled and self.status == "running" else self.status
 
     def enter(self, message: dict[str, object]) -> None:
         """Take in one line of the worker."""
         match message:
             case {"event": "progress", "fraction": float(fraction), "updates": int(updates), "episodes": int(episodes)}:
-                self.fraction, self.updates, self.episodes = fraction, updates, episodes
+                self.fraction, self.updates, self.episodes, self.stalled = fraction, updates, episodes, False
                 self.meter.enter(time.monotonic(), fraction, updates)
             case {"event": "evaluated", "mean_return": float(mean)}:
                 self.evaluation_return = mean
-            case {"event": "warned", "message": str(text)}:
+            case {"event": "warned" | "stalled" as event, "message": str(text)}:
                 self.warnings.append(text)
+                self.stalled = event == "stalled"
             case {"event": "finished"}:
                 self.status, self.fraction = "finished", 1.0
             case {"event": "interrupted"}:
                 self.status = "interrupted"
+            case {"event": "in_use"}:
+                self.status = "waiting"
             case {"event": "failed", "message": str(text)}:
                 self.status, self.message = "failed", text
 
@@ -64,8 +79,20 @@ class Task:
     """Places in the run group, at least as many as runs; 0 for a run alone."""
 
     @property
+    def stalled(self) -> bool:
+        return any(run.stalled for run in self.runs)
+
+    @property
     def started(self) -> bool:
         return self.runs[0].status != "waiting"
+
+    def found_elsewhere(self) -> bool:
+        """Look at the folders: note what has finished; whether another process trains one of its runs."""
+        for run in self.runs:
+            run.elsewhere = holder(run.cell.folder) or ""
+            if not run.elsewhere and run.cell.finished:
+                run.status, run.fraction = "finished", 1.0
+        return any(run.elsewhere for run in self.runs)
 
     def start(self) -> None:
         for run in self.runs:

@@ -6,16 +6,20 @@ The task comes as JSON on standard input; each event goes out as a line of JSON 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from saclab.config import Config
+from saclab.environments.foreign import prints_apart
+from saclab.environments.watch import log
 from saclab.exits import end_after
 from saclab.signals import die_with
-from saclab.training.lock import wait_until_free
+from saclab.training.lock import InUse, wait_until_free
 
 if TYPE_CHECKING:
     from saclab.training.events import Event
@@ -24,8 +28,7 @@ if TYPE_CHECKING:
 
 def main() -> int:
     """Train the runs; exit status 0 if they finished or were stopped on request, else that of `saclab train`."""
-    task, answers = json.load(sys.stdin), os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what an environment prints must not end up among the answers
+    task = json.load(sys.stdin)
     if task["cores"]:
         os.sched_setaffinity(0, task["cores"])  # before JAX starts its threads, which inherit it
     if task["launcher"]:
@@ -34,14 +37,16 @@ def main() -> int:
         wait_until_free(Path(run["folder"]), task["patience"])
     from saclab.signals import requests_from_signals
 
-    with requests_from_signals(process_ends=True) as requests:
+    with requests_from_signals(process_ends=True) as requests, prints_apart() as answers:
 
         def tell(run: int, **message: object) -> None:
             try:
-                print(json.dumps({"run": run, **message}), file=answers, flush=True)
+                write_line(answers, {"run": run, **message})
             except BrokenPipeError:  # the launcher is gone: nobody would look after these runs
                 requests.stop = requests.stop or 1
 
+        log.addHandler(logging.StreamHandler())
+        log.addHandler(Teller(tell))
         going_on = set(range(len(task["runs"])))
         try:
             for run, event in events(task, requests):
@@ -52,9 +57,31 @@ def main() -> int:
         except Exception as error:
             status, line = end_after(error)
             for run in going_on:
-                tell(run, event="failed", message=line)
+                tell(run, event="in_use" if isinstance(error, InUse) else "failed", message=line)
             return status
     return 0
+
+
+LINE = threading.Lock()  # a thread that watches environments speaks too
+
+
+def write_line(answers: int, message: Mapping[str, object]) -> None:
+    content = memoryview(json.dumps(message).encode() + b"\n")
+    with LINE:
+        while content:
+            content = content[os.write(answers, content) :]
+
+
+class Teller(logging.Handler):
+    """Tells the launcher what is logged of environments."""
+
+    def __init__(self, tell: Callable[..., None]) -> None:
+        super().__init__()
+        self.tell = tell
+
+    def emit(self, record: logging.LogRecord) -> None:
+        stalled = getattr(record, "stalled", False)
+        self.tell(0, event="stalled" if stalled else "warned", message=record.getMessage())
 
 
 def events(task: dict[str, Any], requests: Requests) -> Iterator[tuple[int, Event]]:

@@ -9,8 +9,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from saclab.config import Config
-from saclab.environments.checked import checked_reset, checked_step
-from saclab.environments.make import EnvironmentSpec, environment_spec, make_environment
+from saclab.environments.checked import CheckedEnvironment
+from saclab.environments.make import EnvironmentSpec
 from saclab.environments.reward_terms import split_reward
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken
@@ -81,7 +81,8 @@ class Engine(Protocol):
     def drop(self, run: int) -> None:
         """Go on without a run that has finished or failed."""
 
-    def close(self) -> None: ...
+    def close(self) -> Sequence[tuple[int, RunBroken]]:
+        """Close the environments; run -> what went wrong then, which harms no result."""
 
 
 class EngineBuilder(Protocol):
@@ -129,15 +130,15 @@ class EnvironmentStateError(CheckpointError):
 @same_directory()
 def spec_of(config: Config) -> EnvironmentSpec:
     """What a learner must know of a run's environment; raises UserError if it cannot be trained on."""
-    environment = make_environment(config.environment, config.environment_arguments)
+    environment = CheckedEnvironment(config.environment, config.environment_arguments)
     try:
-        spec = environment_spec(config.environment, environment)
         if names := config.algorithm.reward_terms:
-            checked_reset(environment, spec.observation_size, seed=0)
-            middle = spec.scale_action(np.zeros(spec.action_size))
-            _, reward, _, _, info = checked_step(environment, middle, spec.observation_size)
+            environment.reset(seed=0)
+            _, reward, _, _, info = environment.step(
+                environment.spec.scale_action(np.zeros(environment.spec.action_size))
+            )
             split_reward(config.environment, reward, info, names)
-        return spec
+        return environment.spec
     finally:
         environment.close()
 

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saclab.environments.checked import checked_reset, checked_step
-from saclab.environments.make import environment_spec, make_environment
-from saclab.errors import NonFiniteError
+from saclab.environments.checked import CheckedEnvironment
+from saclab.errors import NonFiniteError, RunBroken
 
 
 class EvaluationEpisodes(NamedTuple):
@@ -24,28 +23,30 @@ class Evaluator:
 
     def __init__(self, environment: str, arguments: Mapping[str, Any]) -> None:
         self.name, self.arguments = environment, arguments
-        self.environments = [make_environment(environment, arguments)]
-        self.spec = environment_spec(environment, self.environments[0])
+        self.environments = [CheckedEnvironment(environment, arguments)]
+        self.spec = self.environments[0].spec
 
+    @np.errstate(over="ignore")  # what is beyond 32 bits is refused as not finite
     def run(self, act: Callable[[np.ndarray], np.ndarray], seeds: Sequence[int]) -> EvaluationEpisodes:
         """One episode per seed; `act` takes observations f32[n, O] and gives actions f32[n, A] in [-1, 1].
 
         Raises:
             NonFiniteError: if an environment gives an observation or a reward that is not finite.
+            RunBroken: if one breaks its word or raises an error.
         """
         while len(self.environments) < len(seeds):
-            self.environments.append(make_environment(self.name, self.arguments))
-        size = self.spec.observation_size
-        observation = np.zeros((len(seeds), size), np.float32)
+            self.environments.append(CheckedEnvironment(self.name, self.arguments))
+        observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
         for index, seed in enumerate(seeds):
-            observation[index] = checked_reset(self.environments[index], size, seed)
+            observation[index] = self.environments[index].reset(seed)
         total_rewards, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
+        self._require_finite(observation, total_rewards)
         active = list(range(len(seeds)))
         while active:
             actions = self.spec.scale_action(act(observation[active]))
             going_on = []
             for index, action in zip(active, actions, strict=True):
-                seen, reward, terminated, truncated, _ = checked_step(self.environments[index], action, size)
+                seen, reward, terminated, truncated, _ = self.environments[index].step(action)
                 observation[index] = seen
                 total_rewards[index] += reward
                 lengths[index] += 1
@@ -64,6 +65,6 @@ class Evaluator:
                 "check the environment, or wrap it so that it ends the episode before it diverges"
             )
 
-    def close(self) -> None:
-        for environment in self.environments:
-            environment.close()
+    def close(self) -> list[RunBroken]:
+        """Close the environments; what went wrong then, which harms no result."""
+        return [error for environment in self.environments if (error := environment.close())]

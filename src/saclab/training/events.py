@@ -81,6 +81,8 @@ class Failed(NamedTuple):
     message: str
     not_finite: bool = True
     """Whether it is about a number that is not finite."""
+    traceback: str = ""
+    """Where the environment's own code raised an error, if it did."""
 
 
 class Interrupted(NamedTuple):

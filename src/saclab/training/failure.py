@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import safetensors.numpy
 
-from saclab.errors import RunBroken
+from saclab.environments.watch import log
+from saclab.errors import RunBroken, TrainingFailed, UserError, for_terminal
 from saclab.files import replace_file, write_json
 from saclab.training.checkpoint import newest_first
 from saclab.training.learners import named_leaves
@@ -23,6 +26,7 @@ def write_failure_report(folder: Path, snapshot: Snapshot, error: RunBroken) -> 
 
     Files:
         failure.json: the message, the counters, and the traceback of an environment that raised an error.
+        traceback.txt: that traceback, for people.
         state.safetensors: the learner's arrays by name; recent_transitions f32[n, width], oldest first, packed as in
             the replay buffer; observation f32[N, O] before the step; metrics f32[updates, M] since the last line of
             metrics.jsonl; and what the error brought: action f32[A], next_observation f32[O] and reward f64[] of the
@@ -37,12 +41,50 @@ def write_failure_report(folder: Path, snapshot: Snapshot, error: RunBroken) -> 
         counters = dataclasses.asdict(snapshot.run.counters)
         story = {"message": str(error), "counters": counters, "traceback": error.traceback}
         write_json(failure / "failure.json", story)
+        write_traceback(failure, error)
         replace_file(failure / "state.safetensors", safetensors.numpy.save(report_arrays(snapshot, error)))
         left = f"What led to it lies in {failure}"
     except OSError as problem:
         left = f"What led to it could not be written to {folder} ({problem.strerror})"
     kept = newest_first(folder / "checkpoints")
     return left + (f"; the last checkpoint, {kept[0].name}, is kept" if kept else "")
+
+
+TRACEBACK = "traceback.txt"
+
+
+def write_traceback(folder: Path, error: UserError | TrainingFailed) -> None:
+    """Keep the traceback of an environment that raised an error; raises OSError if it cannot be written."""
+    if error.traceback:
+        folder.mkdir(exist_ok=True)
+        replace_file(folder / TRACEBACK, error.traceback.encode())
+
+
+@contextmanager
+def tracebacks_in(folders: Sequence[Path]) -> Iterator[None]:
+    """Leave the traceback of what an environment raises in every one of these folders that is there, and say so."""
+    try:
+        yield
+    except (UserError, TrainingFailed) as error:
+        there = [folder for folder in folders if error.traceback and folder.is_dir()]
+        try:
+            for folder in there:
+                write_traceback(folder, error)
+        except OSError as problem:
+            error.args = (f"{error}. Its traceback could not be written to {folder} ({problem.strerror})",)
+        else:
+            error.args = (f"{error}. The whole traceback lies in {there[0] / TRACEBACK}",) if there else error.args
+        raise
+
+
+def tell_of_closing(problems: Sequence[tuple[int, RunBroken]], folders: Sequence[Path]) -> None:
+    """Say what environments raised when they were closed: their runs have come to no harm."""
+    for run, error in problems:
+        try:
+            with tracebacks_in([folders[run]]):
+                raise error
+        except RunBroken as told:
+            log.warning(f"{for_terminal(told, str(told))}. The run itself has come to no harm")
 
 
 def report_arrays(snapshot: Snapshot, error: RunBroken) -> dict[str, np.ndarray]:

@@ -153,8 +153,10 @@ class LocalEngine:
         critics = critics_of(
             config, self.learner, self.actor(0), np.array(state.critic.weights), np.asarray(state.temperature.weights)
         )
-        environment, number = self.evaluator.environments[0], self.run.counters.evaluations
-        return {0: q_bias_at(config, critics, environment, self.spec, number)}
+        try:
+            return {0: q_bias_at(config, critics, self.evaluator.environments[0], self.run.counters.evaluations)}
+        except RunBroken as error:
+            return {0: error}
 
     def snapshot(self, run: int) -> Snapshot:
         return Snapshot(self.run, self.learner_state, self.behaviour, self.environments.observation, self.replay)
@@ -165,9 +167,8 @@ class LocalEngine:
     def drop(self, run: int) -> None:
         """Nothing is left to go on with."""
 
-    def close(self) -> None:
-        self.environments.close()
-        self.evaluator.close()
+    def close(self) -> list[tuple[int, RunBroken]]:
+        return [(0, error) for error in (*self.environments.close(), *self.evaluator.close())]
 
 
 def restored_environments(start: Start) -> TrainingEnvironments:

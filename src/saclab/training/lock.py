@@ -8,10 +8,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from saclab.errors import UserError
 
 RETRY_SECONDS = 0.5
+LOOKS, LOOK_SECONDS = 5, 0.02  # `holder` has the lock for a moment, too: who finds it taken looks again
+
+
+class InUse(UserError):  # noqa: N818 - it names what is
+    """Another process works on the run folder."""
 
 
 @contextmanager
@@ -19,21 +25,50 @@ def locked(folder: Path) -> Iterator[None]:
     """Hold the run folder; the system lets go of it when the process ends, however it ends.
 
     Raises:
-        UserError: if another process holds it, with that one's id.
+        InUse: if another process holds it, with that one's id.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+        if not taken(file, fcntl.LOCK_EX):
             file.seek(0)
-            raise UserError(
-                f"{folder} is in use by process {file.read(20).strip() or '?'}: wait for it, or stop it first"
-            ) from error
+            raise InUse(f"{folder} is in use by process {file.read(20).strip() or '?'}: wait for it, or stop it first")
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
         yield
+
+
+def taken(file: IO[str], kind: int) -> bool:
+    """Take a lock, unless another process keeps it."""
+    for look in range(LOOKS):
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            time.sleep(LOOK_SECONDS * (look + 1 < LOOKS))
+    return False
+
+
+def holder(folder: Path) -> str | None:
+    """The id of the process that works on the run folder; None if there is none."""
+    try:
+        with (folder / "lock").open() as file:
+            return None if taken(file, fcntl.LOCK_SH) else file.read(20).strip() or "?"
+    except OSError:
+        return None
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Wait until no other process is in here with this folder; a file system that knows no locks lets all in."""
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def wait_until_free(folder: Path, seconds: float) -> None:

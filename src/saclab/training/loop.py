@@ -9,11 +9,12 @@ from pathlib import Path
 
 from saclab.config import Config
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
+from saclab.files import absolute
 from saclab.limits import require_minutes
 from saclab.machine import machine_facts
 from saclab.training.engine import Engine, EngineBuilder
 from saclab.training.events import Event, Failed, Interrupted, Started
-from saclab.training.failure import write_failure_report
+from saclab.training.failure import tell_of_closing, tracebacks_in, write_failure_report
 from saclab.training.local_engine import LocalBuilder
 from saclab.training.lock import locked
 from saclab.training.process import device_name, prepare_process
@@ -43,13 +44,16 @@ def train(
         UserError: if the folder holds another configuration, or is in use by another process.
         TrainingFailed: if a number is not finite or no checkpoint can be written or read; what was saved is kept.
     """
+    folder = absolute(folder)
     if not unfinished([config], [folder]):
         return
     prepare_process()
-    with closing(train_runs(LocalBuilder(config), [folder], requests, checkpoint_minutes)) as told:
+    with tracebacks_in([folder]):
+        builder = LocalBuilder(config)
+    with closing(train_runs(builder, [folder], requests, checkpoint_minutes)) as told:
         for _, event in told:
             if isinstance(event, Failed):
-                raise (NonFiniteError if event.not_finite else RunBroken)(event.message)
+                raise (NonFiniteError if event.not_finite else RunBroken)(event.message, traceback=event.traceback)
             yield event
 
 
@@ -79,12 +83,13 @@ def train_runs(
         The place of a run, and what it tells.
     """
     require_minutes(checkpoint_minutes)
-    with writing_to(folders), ExitStack() as stack:
+    with writing_to(folders), tracebacks_in(folders), ExitStack() as stack:
         for folder in folders:
             stack.enter_context(locked(folder))
         facts = machine_facts(device_name(), builder.slots)
         beginnings = find_beginnings(builder, folders, facts)
-        engine = stack.enter_context(closing(build(builder, beginnings, folders)))
+        engine = build(builder, beginnings, folders)
+        stack.callback(lambda: tell_of_closing(engine.close(), folders))
         writers = [
             stack.enter_context(closing(RunWriter(beginning, builder.spec, folder, facts)))
             for beginning, folder in zip(beginnings, folders, strict=True)
@@ -179,7 +184,7 @@ class Session:
             error = first
         message = f"{error}. {write_failure_report(self.writers[run].folder, snapshot, error)}"
         self._drop(run)
-        return run, Failed(message, isinstance(error, NonFiniteError))
+        return run, Failed(message, isinstance(error, NonFiniteError), error.traceback)
 
     def _drop(self, run: int) -> None:
         self.active.remove(run)
@@ -244,7 +249,7 @@ class Session:
             with self.requests.while_saving():
                 saved = self.writers[run].save(snapshot, environments)
             yield run, saved
-        except NonFiniteError as error:
+        except RunBroken as error:
             yield self._fail(run, error, snapshot)
 
     def _stop(self) -> Told:

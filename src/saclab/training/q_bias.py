@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from saclab.algorithm.networks.network import Array
 from saclab.algorithm.policy import Policy
 from saclab.algorithm.targets import reduced_q
 from saclab.config import Config
-from saclab.environments.checked import checked_reset, checked_step
-from saclab.environments.make import EnvironmentSpec
+from saclab.environments.checked import CheckedEnvironment
+from saclab.errors import NonFiniteError
 from saclab.training import seeds
 
 NEGLIGIBLE = 0.01  # weight γ^n below which what follows a cut-off state is left out
@@ -86,10 +86,10 @@ def critics_of(
     )  # fmt: skip
 
 
-def q_bias_at(config: Config, critics: Critics, environment: Any, spec: EnvironmentSpec, evaluation: int) -> QBias:
+def q_bias_at(config: Config, critics: Critics, environment: CheckedEnvironment, evaluation: int) -> QBias:
     """The bias after a run's evaluation number `evaluation`, which says what is drawn."""
     return measure_q_bias(
-        critics, environment, spec,
+        critics, environment,
         seeds.integers(config.seed, "q_bias", config.training.q_bias_episodes, evaluation),
         seeds.generator(config.seed, "q_bias", evaluation),
     )  # fmt: skip
@@ -97,13 +97,12 @@ def q_bias_at(config: Config, critics: Critics, environment: Any, spec: Environm
 
 def measure_q_bias(
     critics: Critics,
-    environment: Any,
-    spec: EnvironmentSpec,
+    environment: CheckedEnvironment,
     episode_seeds: Sequence[int],
     generator: np.random.Generator,
 ) -> QBias:
     """Play one episode per seed with the stochastic policy, and compare."""
-    episodes = [play(critics, environment, spec, seed, generator) for seed in episode_seeds]
+    episodes = [play(critics, environment, seed, generator) for seed in episode_seeds]
     known = [known_returns(episode, critics.alpha, critics.discount) for episode in episodes]
     returns = np.concatenate(known)
     q = np.concatenate([
@@ -116,23 +115,25 @@ def measure_q_bias(
     return QBias(len(returns), float(q.mean()), float(returns.mean()), float(bias.mean()), float(bias.std()))
 
 
-def play(
-    critics: Critics, environment: Any, spec: EnvironmentSpec, seed: int, generator: np.random.Generator
-) -> Episode:
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused at the end
+def play(critics: Critics, environment: CheckedEnvironment, seed: int, generator: np.random.Generator) -> Episode:
     """One episode of the stochastic policy."""
-    observation = checked_reset(environment, spec.observation_size, seed)
+    observation, spec = environment.reset(seed), environment.spec
     rows: list[tuple[np.ndarray, np.ndarray, float, float]] = []
     act: Callable[..., tuple[np.ndarray, np.ndarray]] = critics.policy.sample
     while True:
-        seen = np.asarray(observation, np.float32)[None]
+        seen = np.array(observation, np.float32)[None]  # the environment may write over its own
         noise = generator.standard_normal((1, spec.action_size), np.float32)
         action, log_prob = act(critics.actor, seen, noise)
-        observation, reward, terminated, truncated, _ = checked_step(
-            environment, spec.scale_action(action)[0], spec.observation_size
-        )
+        observation, reward, terminated, truncated, _ = environment.step(spec.scale_action(action)[0])
         rows.append((seen[0], action[0], reward, float(log_prob[0])))
         if terminated or truncated:
             break
+    if not (np.isfinite(observation).all() and all(np.isfinite([*seen, reward]).all() for seen, _, reward, _ in rows)):
+        raise NonFiniteError(
+            f"an episode for the Q bias of {environment.name} gave an observation or a reward that is not finite: "
+            "check the environment, or wrap it so that it ends the episode before it diverges"
+        )
     observations, actions, rewards, log_probs = (np.array(column) for column in zip(*rows, strict=True))
     return Episode(observations, actions, rewards, log_probs, terminated)
 

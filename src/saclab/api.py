@@ -12,6 +12,7 @@ from saclab.grid.plan import Cell, make_grid
 from saclab.grid.resources import Resources, chosen_resources
 from saclab.grid.tasks import RunStatus
 from saclab.protocols import make_config
+from saclab.report.runs import read_runs
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
@@ -95,9 +96,9 @@ def _train(config: Config, folder: Path, on_event: Callable[[Event], None], chec
 
 class Comparison(NamedTuple):
     runs: list[RunRecord]
-    """The runs that have begun, finished or not."""
+    """The runs that have begun and can be read, finished or not."""
     failed: dict[Path, str]
-    """Run folder -> what went wrong."""
+    """Run folder -> what went wrong, or why it cannot be read."""
     report: Path | None
     """The report's page; None if no run has anything to show."""
     interrupted: int = 0
@@ -181,12 +182,13 @@ def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> C
     """What came of a grid, with its report in a folder unless the grid was interrupted."""
     failed = {status.cell.folder: status.message for status in statuses if status.status == "failed"}
     begun = [status.cell.folder for status in statuses if (status.cell.folder / "config.json").exists()]
+    runs, damaged = read_runs(begun)
     page = None
-    if begun and not interrupted:
+    if runs and not interrupted:
         from saclab.report.report import write_report
 
-        page = write_report(begun, report)
-    return Comparison([read_run(folder) for folder in begun], failed, page, interrupted)
+        page = write_report([run.path for run in runs], report)
+    return Comparison(runs, damaged | failed, page, interrupted)
 
 
 def reproduce(

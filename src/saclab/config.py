@@ -15,8 +15,7 @@ from saclab.errors import UserError
 from saclab.settings import (
     AlgorithmSettings,
     TrainingSettings,
-    algorithm_from_json,
-    replace_settings,
+    from_plain,
     require,
     structure,
 )
@@ -38,6 +37,11 @@ class Config:
 
     def __post_init__(self) -> None:
         require(0 <= self.seed < 2**63, "seed", self.seed, "use a whole number from 0 to 2**63 - 1")
+        require(
+            is_json(self.environment_arguments),
+            "environment_arguments", self.environment_arguments,
+            "use what JSON has: finite numbers, text, true, false, null, lists and objects",
+        )  # fmt: skip
         batch, training = self.algorithm.batch_size, self.training
         require(
             batch <= training.random_steps,
@@ -62,12 +66,8 @@ class Config:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
-        """Rebuild a Config from `to_dict`; raises SettingError for a setting this version does not know."""
-        return Config(
-            **{key: value for key, value in values.items() if key not in ("algorithm", "training")},
-            algorithm=algorithm_from_json(values["algorithm"]),
-            training=replace_settings(TrainingSettings(max_steps=1, evaluation_interval_steps=1), values["training"]),
-        )
+        """Rebuild a Config from `to_dict`; raises as `saclab.settings.from_plain` does."""
+        return from_plain(Config, values)
 
     @property
     def planned_updates(self) -> int | None:
@@ -85,6 +85,15 @@ class Config:
             for name in sorted(mine.keys() | theirs.keys())
             if mine.get(name) != theirs.get(name)
         }
+
+
+def is_json(value: object) -> bool:
+    """Whether a value can be written as JSON, and read back as it is but for tuples."""
+    try:
+        json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
 
 
 def flatten(values: dict[str, Any]) -> dict[str, Any]:

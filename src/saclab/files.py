@@ -6,6 +6,8 @@ import json
 import os
 from pathlib import Path
 
+import msgspec
+
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a new file and wait until it is on the disk."""
@@ -24,8 +26,9 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path, value: object) -> None:
-    """Replace a file by `value` as JSON."""
-    replace_file(path, (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode())
+    """Replace a file by `value`, a record of saclab.records or plain values, as JSON; never one with NaN in it."""
+    text = json.dumps(msgspec.to_builtins(value), indent=2, ensure_ascii=False, allow_nan=False)
+    replace_file(path, (text + "\n").encode(errors="backslashreplace"))
 
 
 def sync(folder: Path) -> None:

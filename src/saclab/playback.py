@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saclab.environments.make import make_environment, require_import_allowed
+from saclab.environments.make import EnvironmentSpec, environment_spec, make_environment, require_import_allowed
 from saclab.errors import UserError
+from saclab.settings import require
 from saclab.trained_policy import TrainedPolicy, load_policy, read_description
 from saclab.training.evaluation import Evaluator
 
@@ -43,16 +44,31 @@ def evaluate(
     Raises:
         UserError: if the run has no policy, or its environment would import a package not named in `imports`.
     """
+    require_seed(seed)
     policy, description = load_policy(run), read_description(run)
-    require_import_allowed(description["environment"], imports)
-    evaluator = Evaluator(description["environment"], description["environment_arguments"])
+    require_import_allowed(description.environment, imports)
+    evaluator = Evaluator(description.environment, description.environment_arguments)
+    require_fit(policy, description.environment, evaluator.spec)
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
     result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
     evaluator.close()
     return EvaluationResult(
-        description["environment"], episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
+        description.environment, episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
         result.total_rewards.tolist(), result.lengths.tolist(),
     )  # fmt: skip
+
+
+def require_seed(seed: int) -> None:
+    """Raise SettingError for what is no seed."""
+    require(0 <= seed < 2**63, "seed", seed, "use a whole number from 0 to 2**63 - 1")
+
+
+def require_fit(policy: TrainedPolicy, environment: str, spec: EnvironmentSpec) -> None:
+    """Raise UserError for a policy of another environment."""
+    for name in ("observation_size", "action_size"):
+        own, there = getattr(policy.spec, name), getattr(spec, name)
+        if own != there:
+            raise UserError(f"the policy is not one for {environment}: its {name} is {own}, and there it is {there}")
 
 
 def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Sequence[str] = ()) -> str:
@@ -66,11 +82,13 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
         os.environ.setdefault("MUJOCO_GL", "egl")
     import imageio.v2 as imageio
 
+    require_seed(seed)
     policy, description = load_policy(run), read_description(run)
-    require_import_allowed(description["environment"], imports)
-    environment = filmed_environment(description["environment"], description["environment_arguments"], size)
+    require_import_allowed(description.environment, imports)
+    environment = filmed_environment(description.environment, description.environment_arguments, size)
+    require_fit(policy, description.environment, environment_spec(description.environment, environment))
     environment.reset(seed=seed)
-    require_rendering(environment, description["environment"])
+    require_rendering(environment, description.environment)
     frames_per_second = environment.metadata.get("render_fps", 30)
     video.parent.mkdir(parents=True, exist_ok=True)
     partial = video.with_name(video.stem + ".partial" + video.suffix)

@@ -6,10 +6,13 @@ This file imports no numerical library, so that `saclab --help` stays fast.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
 
 from saclab.errors import SettingError, unknown_name
 
@@ -153,6 +156,12 @@ def require_ranges(settings: AlgorithmSettings) -> None:
         value = getattr(settings, name)
         require(value in known, name, value, f"use one of {', '.join(map(str, known))}")
 
+    for name in field_names(type(settings)):
+        value = getattr(settings, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        finite = all(math.isfinite(number) for number in numbers if isinstance(number, float))
+        require(finite, name, value, "use finite numbers")
+
     def check(name: str, condition: Callable[[Any], bool], way_out: str) -> None:
         require(condition(getattr(settings, name)), name, getattr(settings, name), way_out)
 
@@ -287,6 +296,7 @@ class TrainingSettings:
 
 
 Settings = TypeVar("Settings", AlgorithmSettings, TrainingSettings)
+Plain = TypeVar("Plain")
 
 
 def field_names(settings: type[DataclassInstance]) -> tuple[str, ...]:
@@ -303,9 +313,25 @@ def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settin
     return dataclasses.replace(settings, **overrides)
 
 
-def algorithm_from_json(values: Mapping[str, Any]) -> AlgorithmSettings:
-    """The settings in a JSON object, where tuples are lists; raises SettingError for one that does not exist."""
-    return replace_settings(AlgorithmSettings(), values)
+def from_plain(kind: type[Plain], values: object) -> Plain:
+    """A dataclass of settings from plain values, where tuples are lists; what is missing has its default.
+
+    Raises:
+        UserError: for a name that is no setting, or a value that cannot work.
+        msgspec.ValidationError: for a value of another type, with its place.
+    """
+    require_known_names(kind, values)
+    return msgspec.convert(values, kind)
+
+
+def require_known_names(kind: Any, values: object) -> None:
+    """Raise UserError for a name that is no setting of a dataclass or of one inside it."""
+    hints = get_type_hints(kind)
+    for name, value in values.items() if isinstance(values, dict) else ():
+        if name not in hints:
+            raise unknown_name("setting", name, hints)
+        if dataclasses.is_dataclass(hints[name]):
+            require_known_names(hints[name], value)
 
 
 @lru_cache(maxsize=1)

@@ -72,14 +72,14 @@ def test_the_two_kept_checkpoints_share_no_file(stage, folder):
 def test_a_missing_log_or_a_shorter_one_is_named(stage, folder):
     log = folder / "episodes.csv"
     log.write_bytes(log.read_bytes()[:-1])
-    with pytest.raises(UserError, match=r"episodes\.csv is shorter than the checkpoint remembers"):
+    with pytest.raises(UserError, match=r"episodes\.csv is damaged \(it has \d+ bytes, and \d+ were written\)"):
         stage.continue_from(folder)
 
 
 def test_a_session_that_a_crash_cut_short_is_in_nobodys_way(stage, folder):
     sessions = folder / "sessions.jsonl"
     sessions.write_bytes(sessions.read_bytes() + b'{"began": "20')
-    assert read_last_session(folder)["from_step"] == FIRST
+    assert read_last_session(folder).from_step == FIRST
     stage.continue_from(folder)
-    assert read_last_session(folder)["from_step"] == SECOND
+    assert read_last_session(folder).from_step == SECOND
     assert len(sessions.read_text().splitlines()) == 4

@@ -17,7 +17,8 @@ import pytest
 from saclab.errors import TrainingFailed, UserError
 from saclab.trained_policy import load_policy
 from saclab.training.checkpoint import CheckpointError
-from saclab.training.run_folder import LOGS, read_config
+from saclab.training.logs import LOGS
+from saclab.training.run_folder import read_config
 
 from .stage import FIRST, SECOND, change_arrays, newest, older, put, sign
 

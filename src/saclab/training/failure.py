@@ -10,8 +10,8 @@ import safetensors.numpy
 
 from saclab.errors import RunBroken
 from saclab.files import replace_file, write_json
-from saclab.training.checkpoint import newest_first
 from saclab.training.learners import named_leaves
+from saclab.training.manifest import newest_first
 from saclab.training.run_folder import FAILURE
 from saclab.training.snapshot import Snapshot
 

@@ -18,7 +18,8 @@ class SettingError(UserError):
     """A setting's value cannot work."""
 
     def __init__(self, setting: str, value: object, way_out: str) -> None:
-        super().__init__(f"{setting} = {value!r}: {way_out}")
+        text = repr(value)
+        super().__init__(f"{setting} = {text if len(text) <= 200 else text[:199] + '…'}: {way_out}")
         self.setting, self.value, self.way_out = setting, value, way_out
 
 

@@ -26,6 +26,7 @@ JSON_BYTES = 2**26
 """Far more than a description, a result or a manifest takes."""
 UNREADABLE = (msgspec.MsgspecError, RecursionError, ValueError)
 """What msgspec raises for content that does not fit."""
+LET_READ = "put a plain file in its place that this process may read"
 RETRAIN = "restore it, or remove the folder and train again"
 
 Count = Annotated[int, Meta(ge=0, lt=2**53)]
@@ -36,14 +37,22 @@ Record = TypeVar("Record")
 
 
 class Damaged(UserError):  # noqa: N818 - it names what the file is
-    """A file that cannot be read, or is not what saclab has written."""
+    """A file that is not what saclab has written."""
+
+    state = "is damaged"
 
     def __init__(self, path: Path, reason: object, way_out: str = RETRAIN) -> None:
-        super().__init__(f"{path} is damaged ({reason}): {way_out}")
+        super().__init__(f"{path} {self.state} ({reason}): {way_out}")
         self.path, self.reason = path, str(reason)
 
 
-class Missing(Damaged):
+class Unreadable(Damaged):
+    """A file that the system does not let be read, or that is none."""
+
+    state = "cannot be read"
+
+
+class Missing(Unreadable):
     """There is no such file."""
 
 
@@ -179,7 +188,7 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             status, available = os.fstat(file.fileno()), available_memory()
             if not stat.S_ISREG(status.st_mode):
-                raise Damaged(path, "it is no plain file")
+                raise Unreadable(path, "it is no plain file", LET_READ)
             if limit is not None and status.st_size > limit:
                 raise Damaged(path, f"it has {status.st_size} bytes, more than the {limit} that it can have")
             if available is not None and status.st_size > available:
@@ -188,7 +197,7 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
     except FileNotFoundError as error:
         raise Missing(path, "it is missing") from error
     except OSError as error:
-        raise Damaged(path, error.strerror or error) from error
+        raise Unreadable(path, error.strerror or error, LET_READ) from error
 
 
 def from_json(path: Path, content: bytes, schema: type[Record]) -> Record:

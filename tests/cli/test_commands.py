@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -16,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from saclab.trained_policy import load_policy, save_policy
 from saclab.training.run_folder import read_run
 
 SMALL = ("--random-steps", "200", "--batch-size", "32", "--hidden-layers", "16", "16", "--evaluation-episodes", "2")
@@ -234,6 +236,11 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
     assert "--imports trap" in refused.stderr
     assert not (tmp_path / "sprung").exists()
     if command == "evaluate":
+        for path in (run / "best").iterdir():
+            shutil.copy(run_folder(trained) / "best" / path.name, path)
+        policy = load_policy(run)
+        config = dataclasses.replace(read_run(run_folder(trained)).config, environment="trap:Pendulum-v1")
+        save_policy(run / "best", config, policy.spec, policy.parameters, {})
         allowed = saclab(command, str(run), "--episodes", "1", "--imports", "trap", folder=tmp_path)
         assert allowed.returncode == 0, allowed.stderr
         assert (tmp_path / "sprung").exists()
@@ -258,6 +265,13 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
         (("report", "nowhere"), "no run folder"),
         (("compare", "Pendulum-v1", "--variants", "sac", "nonsense"), "unknown variant 'nonsense'"),
         (("compare", "Pendulum-v1", "--seeds", "0"), "seeds = 0"),
+        (("evaluate", "nowhere", "--seed", "-1"), "seed = -1"),
+        (("record", "nowhere", "--seed", "-1"), "seed = -1"),
+        (("train", "Pendulum-v1", "--name", "x" * 300), "use at most 200 letters"),
+        (("resume", "x" * 300), "File name too long"),
+        (("report", "x" * 300), "File name too long"),
+        (("train", "Pendulum-v1", "--environment-arguments", '{"g": NaN}'), "not JSON"),
+        (("train", "Pendulum-v1", "--target-entropy", "nan"), "use finite numbers"),
     ],
 )
 def test_bad_input_gets_a_clear_line_and_status_2(tmp_path: Path, arguments: tuple[str, ...], expected: str) -> None:

@@ -305,6 +305,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def harmless(cell: object) -> object:
-    if isinstance(cell, str) and (cell.lstrip().startswith(FORMULA_BEGINNINGS) or cell[:1] in ("\t", "\r", "\n")):
-        return "'" + cell
-    return cell
+    if not isinstance(cell, str):
+        return cell
+    text = cell.replace("\r", " ")
+    return "'" + text if text.lstrip().startswith(FORMULA_BEGINNINGS) else text

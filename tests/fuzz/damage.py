@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -26,13 +27,14 @@ damages = st.tuples(
     st.sampled_from((
         "cut", "flip", "put", "value", "delete", "duplicate line", "drop line", "swap lines", "duplicate column",
         "swap files", "directory", "dangling link", "link to itself", "pipe", "parent becomes file", "append",
+        "hostile manifest",
     )),
     st.floats(0, 1, exclude_max=True), st.floats(0, 1, exclude_max=True), st.integers(0, 255),
 )  # fmt: skip
 
 
 def apply(run: Path, damage: Damage) -> None:
-    """Do it to a file of the folder, if there is one left."""
+    """Do it to a file of the folder, if there is one left. A hostile manifest has the checksum that belongs to it."""
     kind, which, where, choice = damage
     files = sorted(path for path in run.rglob("*") if path.is_file() and not path.is_symlink())
     if not files:
@@ -67,6 +69,13 @@ def apply(run: Path, damage: Damage) -> None:
         case "parent becomes file" if path.parent != run:
             shutil.rmtree(path.parent)
             path.parent.write_bytes(content)
+        case "hostile manifest":
+            manifests = [path for path in files if path.name == "manifest.json"]
+            if manifests:
+                path = manifests[int(which * len(manifests))]
+                content = with_value(path.read_bytes(), where, OTHER_VALUES[choice % len(OTHER_VALUES)])
+                path.write_bytes(content)
+                path.with_name("manifest.sha256").write_text(hashlib.sha256(content).hexdigest() + "\n")
         case "append":
             path.write_bytes(content + OTHER_TEXTS[choice % len(OTHER_TEXTS)] + b"\n" * (choice % 2))
 

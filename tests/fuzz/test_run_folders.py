@@ -6,10 +6,12 @@ And what is read is right: where success is claimed, every evaluation is there a
 from __future__ import annotations
 
 import shutil
+import signal
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -29,7 +31,7 @@ from saclab.training.common_checkpoint import group_slots
 from saclab.training.events import Evaluated, Saved
 from saclab.training.local_engine import LocalBuilder
 from saclab.training.logs import Logs
-from saclab.training.manifest import CheckpointError, newest_first, read_manifest
+from saclab.training.manifest import newest_first
 from saclab.training.run_folder import find_runs, read_config, read_last_session, read_run
 from saclab.training.starts import find_beginnings
 
@@ -85,16 +87,30 @@ def resume(runs: Runs, folder: Path) -> None:
         Logs(folder, config.training.evaluation_episodes, beginning.logs).close()
 
 
-def is_whole(checkpoint: Path) -> bool:
-    """Whether what a checkpoint has recorded can still be read, so that it can tell of damage elsewhere."""
+def is_same(checkpoint: Path, original: Path) -> bool:
+    """Whether what a checkpoint has recorded is still there, so that it can tell of damage elsewhere."""
+    pairs = [(checkpoint / name, original / name) for name in ("manifest.json", "manifest.sha256")]
+    return all(path.is_file() and path.read_bytes() == own.read_bytes() for path, own in pairs)
+
+
+@contextmanager
+def limited(seconds: int) -> Iterator[None]:
+    """Break off what hangs."""
+
+    def stop(*_: object) -> NoReturn:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(seconds)
     try:
-        return bool(read_manifest(checkpoint))
-    except CheckpointError:
-        return False
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def check(runs: Runs, name: str, found: list[Damage]) -> None:
-    with tempfile.TemporaryDirectory() as root:
+    with tempfile.TemporaryDirectory() as root, limited(20):
         folder = Path(root) / "run"
         shutil.copytree(runs.folders[name], folder)
         for damage in found:
@@ -104,7 +120,8 @@ def check(runs: Runs, name: str, found: list[Damage]) -> None:
             scores = [score_environment(comparison, environment) for environment in comparison.environments]
             scores_csv(comparison, scores)
             (run,) = comparison.runs
-            if (folder / "result.json").is_file() or is_whole(folder / "checkpoints" / runs.newest[name]):
+            newest = Path("checkpoints") / runs.newest[name]
+            if (folder / "result.json").is_file() or is_same(folder / newest, runs.folders[name] / newest):
                 expected, means = runs.evaluations[name], run.evaluations["mean_return"]
                 np.testing.assert_array_equal(means[: len(expected)], expected)
         told(lambda: (load_policy(folder), read_description(folder)))

@@ -11,10 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from saclab.api import compared
 from saclab.errors import UserError
+from saclab.grid.plan import Cell
+from saclab.grid.tasks import make_statuses
 from saclab.report.report import write_report
 from saclab.report.runs import read_comparison
-from saclab.training.run_folder import find_runs, read_run
+from saclab.training.run_folder import find_runs, read_config, read_run
 
 from .synthetic import write_run
 
@@ -94,6 +97,16 @@ def test_runs_that_do_not_compare_are_still_refused(folders, tmp_path):
     write_run(folders, "averaged", overrides={"replay_capacity": 300_000})
     with pytest.raises(UserError, match="not comparable"):
         read_comparison(find_runs([folders]))
+
+
+def test_a_comparison_reports_what_it_can_read_and_calls_the_rest_failed(tmp_path):
+    runs = [write_run(tmp_path, seed=seed, evaluations=2) for seed in (0, 1)]
+    cells = [Cell(read_config(run), run) for run in runs]
+    (runs[1] / "evaluations.csv").write_text("nothing\n")
+    result = compared(make_statuses(cells), tmp_path / "report", 0)
+    assert [run.path for run in result.runs] == runs[:1]
+    assert "evaluations.csv is damaged" in result.failed[runs[1]]
+    assert result.report is not None
 
 
 @pytest.mark.parametrize("place", ["file", "file/report", "/proc/none"])

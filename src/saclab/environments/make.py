@@ -90,10 +90,11 @@ def making(environment: str, arguments: Mapping[str, Any]) -> Iterator[None]:
     except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound, gymnasium.error.VersionNotFound,
             gymnasium.error.DeprecatedEnv, gymnasium.error.UnregisteredEnv) as error:  # fmt: skip
         raise unknown_environment(environment) from error
-    except (TypeError, OSError) as error:
+    except (TypeError, OSError, ValueError) as error:
         raise SettingError(
-            "environment_arguments", dict(arguments), f"{environment} does not accept them ({error})"
-        ) from error
+            "environment_arguments", dict(arguments),
+            f"{environment} does not accept them ({' '.join(str(error).split())})",
+        ) from error  # fmt: skip
     except (gymnasium.error.Error, ImportError) as error:
         raise UserError(f"environment = {environment!r}: {error}") from error
 

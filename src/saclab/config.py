@@ -9,16 +9,19 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar, get_type_hints
 
-from saclab.errors import UserError
+import msgspec
+
+from saclab.errors import UserError, unknown_name
 from saclab.settings import (
     AlgorithmSettings,
     TrainingSettings,
-    from_plain,
     require,
     structure,
 )
+
+Plain = TypeVar("Plain")
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class Config:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
-        """Rebuild a Config from `to_dict`; raises as `saclab.settings.from_plain` does."""
+        """Rebuild a Config from `to_dict`; raises as `from_plain` does."""
         return from_plain(Config, values)
 
     @property
@@ -85,6 +88,27 @@ class Config:
             for name in sorted(mine.keys() | theirs.keys())
             if mine.get(name) != theirs.get(name)
         }
+
+
+def from_plain(kind: type[Plain], values: object) -> Plain:
+    """A dataclass of settings from plain values, where tuples are lists; what is missing has its default.
+
+    Raises:
+        UserError: for a name that is no setting, or a value that cannot work.
+        msgspec.ValidationError: for a value of another type, with its place.
+    """
+    require_known_names(kind, values)
+    return msgspec.convert(values, kind)
+
+
+def require_known_names(kind: Any, values: object) -> None:
+    """Raise UserError for a name that is no setting of a dataclass or of one inside it."""
+    hints = get_type_hints(kind)
+    for name, value in values.items() if isinstance(values, dict) else ():
+        if name not in hints:
+            raise unknown_name("setting", name, hints)
+        if dataclasses.is_dataclass(hints[name]):
+            require_known_names(hints[name], value)
 
 
 def is_json(value: object) -> bool:

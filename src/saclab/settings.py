@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-import msgspec
-
 from saclab.errors import SettingError, unknown_name
 
 if TYPE_CHECKING:
@@ -296,7 +294,6 @@ class TrainingSettings:
 
 
 Settings = TypeVar("Settings", AlgorithmSettings, TrainingSettings)
-Plain = TypeVar("Plain")
 
 
 def field_names(settings: type[DataclassInstance]) -> tuple[str, ...]:
@@ -311,27 +308,6 @@ def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settin
         if name not in known:
             raise unknown_name("setting", name, known)
     return dataclasses.replace(settings, **overrides)
-
-
-def from_plain(kind: type[Plain], values: object) -> Plain:
-    """A dataclass of settings from plain values, where tuples are lists; what is missing has its default.
-
-    Raises:
-        UserError: for a name that is no setting, or a value that cannot work.
-        msgspec.ValidationError: for a value of another type, with its place.
-    """
-    require_known_names(kind, values)
-    return msgspec.convert(values, kind)
-
-
-def require_known_names(kind: Any, values: object) -> None:
-    """Raise UserError for a name that is no setting of a dataclass or of one inside it."""
-    hints = get_type_hints(kind)
-    for name, value in values.items() if isinstance(values, dict) else ():
-        if name not in hints:
-            raise unknown_name("setting", name, hints)
-        if dataclasses.is_dataclass(hints[name]):
-            require_known_names(hints[name], value)
 
 
 @lru_cache(maxsize=1)

@@ -14,12 +14,12 @@ import numpy as np
 import safetensors.numpy
 
 from saclab.algorithm.policy import make_policy
-from saclab.config import Config
+from saclab.config import Config, from_plain
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.files import replace_file, write_json
 from saclab.records import UNREADABLE, Damaged, PolicyDescription, read_bytes, read_json
-from saclab.settings import AlgorithmSettings, from_plain
+from saclab.settings import AlgorithmSettings
 
 ACTION_TYPES = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 ARRAYS, DESCRIPTION = "policy.safetensors", "policy.json"

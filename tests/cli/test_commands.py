@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import re
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 
 from saclab.trained_policy import load_policy, save_policy
-from saclab.training.run_folder import read_run
+from saclab.training.run_folder import read_config, read_run
 
 SMALL = ("--random-steps", "200", "--batch-size", "32", "--hidden-layers", "16", "16", "--evaluation-episodes", "2")
 SHORT = (*SMALL, "--max-updates", "300", "--evaluation-interval-steps", "250", "--log-interval", "50")
@@ -228,19 +227,17 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
     run = tmp_path / "received"
     shutil.copytree(run_folder(trained), run)
     (run / "result.json").unlink()
-    for path in (run / "config.json", run / "best" / "policy.json"):
-        path.write_text(path.read_text().replace('"Pendulum-v1"', '"trap:Pendulum-v1"'))
+    shutil.rmtree(run / "checkpoints")  # an enemy's checksums would be right
+    path = run / "config.json"
+    path.write_text(path.read_text().replace('"Pendulum-v1"', '"trap:Pendulum-v1"'))
+    policy = load_policy(run)
+    save_policy(run / "best", read_config(run), policy.spec, policy.parameters, {})
     (tmp_path / "trap.py").write_text("open('sprung', 'w').close()")
     refused = saclab(command, str(run), folder=tmp_path)
     assert refused.returncode == 2
     assert "--imports trap" in refused.stderr
     assert not (tmp_path / "sprung").exists()
     if command == "evaluate":
-        for path in (run / "best").iterdir():
-            shutil.copy(run_folder(trained) / "best" / path.name, path)
-        policy = load_policy(run)
-        config = dataclasses.replace(read_run(run_folder(trained)).config, environment="trap:Pendulum-v1")
-        save_policy(run / "best", config, policy.spec, policy.parameters, {})
         allowed = saclab(command, str(run), "--episodes", "1", "--imports", "trap", folder=tmp_path)
         assert allowed.returncode == 0, allowed.stderr
         assert (tmp_path / "sprung").exists()

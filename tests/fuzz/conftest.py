@@ -13,7 +13,7 @@ CHECKS = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture, HealthCheck
 settings.register_profile(
     "fast", max_examples=100, derandomize=True, database=None, deadline=5000, suppress_health_check=CHECKS
 )
-settings.register_profile("slow", parent=settings.get_profile("fast"), max_examples=3000)
+settings.register_profile("slow", parent=settings.get_profile("fast"), max_examples=2000)
 settings.register_profile(
     "long", parent=settings.get_profile("fast"), max_examples=20_000, derandomize=False, print_blob=True
 )

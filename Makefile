@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 PEERS := .venv-peers
 
-.PHONY: quickstart test test-slow check lint format types benchmark clean
+.PHONY: quickstart test test-slow fuzz check lint format types benchmark clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
@@ -15,6 +15,9 @@ test: $(VENV)/installed  ## the fast tests
 
 test-slow: $(VENV)/installed  ## learning to a threshold, long kill-and-resume
 	$(BIN)/python -m pytest -n auto --dist loadfile -m slow
+
+fuzz: $(VENV)/installed  ## look for damage and misuse that is not told of, for as long as it takes
+	SACLAB_FUZZ=long $(BIN)/python -m pytest -m "slow or not slow" tests/fuzz
 
 check: lint types test
 

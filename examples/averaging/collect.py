@@ -16,7 +16,6 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-KEPT = ("config.json", "result.json")
 EVERY = {"metrics.jsonl": 10, "episodes.csv": 5, "evaluations.csv": 1, "q_bias.csv": 1}
 """Of each log, the lines that are kept."""
 
@@ -27,8 +26,10 @@ def main() -> None:
         run = result.parent
         copy = HERE / "runs" / run.relative_to(root)
         copy.mkdir(parents=True, exist_ok=True)
-        for name in KEPT:
-            shutil.copyfile(run / name, copy / name)
+        shutil.copyfile(run / "config.json", copy / "config.json")
+        told = json.loads(result.read_text())
+        told.pop("files", None)  # the checksums of logs with all their lines
+        (copy / "result.json").write_text(json.dumps(told, indent=2) + "\n")
         for name, every in EVERY.items():
             thin = thin_json_lines if name.endswith(".jsonl") else thin_csv
             (copy / name).write_text(thin((run / name).read_text(), every))

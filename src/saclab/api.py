@@ -14,6 +14,7 @@ from saclab.grid.resources import Resources, chosen_resources
 from saclab.grid.tasks import RunStatus
 from saclab.limits import require_minutes
 from saclab.protocols import make_config
+from saclab.report.runs import read_runs
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
 from saclab.training.lock import alone_in
@@ -100,9 +101,9 @@ def _train(config: Config, folder: Path, on_event: Callable[[Event], None], chec
 
 class Comparison(NamedTuple):
     runs: list[RunRecord]
-    """The runs that have begun, finished or not."""
+    """The runs that have begun and can be read, finished or not."""
     failed: dict[Path, str]
-    """Run folder -> what went wrong."""
+    """Run folder -> what went wrong, or why it cannot be read."""
     report: Path | None
     """The report's page; None if no run has anything to show."""
     interrupted: int = 0
@@ -192,28 +193,34 @@ def reporting(
     for statuses in stream:
         left = [status for status in statuses if status.status in ("running", "waiting")]
         before, hangs = hangs, bool(left) and all(status.stalled for status in left)
-        if hangs and not before and (page := write_page(statuses, report)):
+        if hangs and not before and (page := write_page(read_begun(statuses)[0], report)):
             tell(f"nothing goes on but {len(left)} run(s) that hang; until they do or are stopped: report: {page}")
         yield statuses
 
 
-def write_page(statuses: Sequence[RunStatus], report: Path) -> Path | None:
-    """Write the report of the runs that have begun, one process at a time; None if there are none."""
+def read_begun(statuses: Sequence[RunStatus]) -> tuple[list[RunRecord], dict[Path, str]]:
+    """The runs of a grid that have begun, and the reasons why some of their folders cannot be read."""
+    folders = [status.cell.folder for status in statuses]
+    return read_runs([folder for folder in folders if (folder / "config.json").exists()])
+        [cell.folder for cell in (status.cell for status in statuses) if (cell.folder / "config.json").exists()]
+    )
+
+
+def write_page(runs: Sequence[RunRecord], report: Path) -> Path | None:
+    """Write the report of runs, one process at a time; None if there are none."""
     from saclab.report.report import write_report
 
-    begun = [status.cell.folder for status in statuses if (status.cell.folder / "config.json").exists()]
-    if not begun:
+    if not runs:
         return None
     with alone_in(report):
-        return write_report(begun, report)
+        return write_report([run.path for run in runs], report)
 
 
 def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> Comparison:
     """What came of a grid, with its report in a folder unless the grid was interrupted."""
     failed = {status.cell.folder: status.message for status in statuses if status.status == "failed"}
-    begun = [status.cell.folder for status in statuses if (status.cell.folder / "config.json").exists()]
-    page = None if interrupted else write_page(statuses, report)
-    return Comparison([read_run(folder) for folder in begun], failed, page, interrupted)
+    runs, damaged = read_begun(statuses)
+    return Comparison(runs, damaged | failed, None if interrupted else write_page(runs, report), interrupted)
 
 
 def reproduce(

@@ -9,17 +9,19 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar, get_type_hints
 
-from saclab.errors import UserError
+import msgspec
+
+from saclab.errors import UserError, unknown_name
 from saclab.settings import (
     AlgorithmSettings,
     TrainingSettings,
-    algorithm_from_json,
-    replace_settings,
     require,
     structure,
 )
+
+Plain = TypeVar("Plain")
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,11 @@ class Config:
 
     def __post_init__(self) -> None:
         require(0 <= self.seed < 2**63, "seed", self.seed, "use a whole number from 0 to 2**63 - 1")
+        require(
+            is_json(self.environment_arguments),
+            "environment_arguments", self.environment_arguments,
+            "use what JSON has: finite numbers, text, true, false, null, lists and objects",
+        )  # fmt: skip
         batch, training = self.algorithm.batch_size, self.training
         require(
             batch <= training.random_steps,
@@ -62,12 +69,8 @@ class Config:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Config:
-        """Rebuild a Config from `to_dict`; raises SettingError for a setting this version does not know."""
-        return Config(
-            **{key: value for key, value in values.items() if key not in ("algorithm", "training")},
-            algorithm=algorithm_from_json(values["algorithm"]),
-            training=replace_settings(TrainingSettings(max_steps=1, evaluation_interval_steps=1), values["training"]),
-        )
+        """Rebuild a Config from `to_dict`; raises as `from_plain` does."""
+        return from_plain(Config, values)
 
     @property
     def planned_updates(self) -> int | None:
@@ -85,6 +88,36 @@ class Config:
             for name in sorted(mine.keys() | theirs.keys())
             if mine.get(name) != theirs.get(name)
         }
+
+
+def from_plain(kind: type[Plain], values: object) -> Plain:
+    """A dataclass of settings from plain values, where tuples are lists; what is missing has its default.
+
+    Raises:
+        UserError: for a name that is no setting, or a value that cannot work.
+        msgspec.ValidationError: for a value of another type, with its place.
+    """
+    require_known_names(kind, values)
+    return msgspec.convert(values, kind)
+
+
+def require_known_names(kind: Any, values: object) -> None:
+    """Raise UserError for a name that is no setting of a dataclass or of one inside it."""
+    hints = get_type_hints(kind)
+    for name, value in values.items() if isinstance(values, dict) else ():
+        if name not in hints:
+            raise unknown_name("setting", name, hints)
+        if dataclasses.is_dataclass(hints[name]):
+            require_known_names(hints[name], value)
+
+
+def is_json(value: object) -> bool:
+    """Whether a value can be written as JSON, and read back as it is but for tuples."""
+    try:
+        json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
 
 
 def flatten(values: dict[str, Any]) -> dict[str, Any]:

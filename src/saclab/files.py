@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
+
 from saclab.errors import UserError
 
 
@@ -54,8 +56,9 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path, value: object) -> None:
-    """Replace a file by `value` as JSON."""
-    replace_file(path, (json.dumps(value, indent=2, ensure_ascii=False) + "\n").encode())
+    """Replace a file by `value`, a record of saclab.records or plain values, as JSON; never one with NaN in it."""
+    text = json.dumps(msgspec.to_builtins(value), indent=2, ensure_ascii=False, allow_nan=False)
+    replace_file(path, (text + "\n").encode(errors="backslashreplace"))
 
 
 def sync(folder: Path) -> None:

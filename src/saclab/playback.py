@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from saclab.environments.checked import CheckedEnvironment
-from saclab.environments.make import require_import_allowed
+from saclab.environments.make import EnvironmentSpec, require_import_allowed
 from saclab.errors import RunBroken, UserError
 from saclab.files import absolute
+from saclab.settings import require
 from saclab.trained_policy import TrainedPolicy, load_policy, read_description
 from saclab.training.evaluation import Evaluator
 from saclab.training.failure import tell_of_closing, tracebacks_in
@@ -47,20 +48,35 @@ def evaluate(
         UserError: if the run has no policy, or its environment would import a package not named in `imports`.
         RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
     """
+    require_seed(seed)
     policy, description = load_policy(run), read_description(run)
     run = absolute(run)
-    require_import_allowed(description["environment"], imports)
+    require_import_allowed(description.environment, imports)
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
     with tracebacks_in([run]):
-        evaluator = Evaluator(description["environment"], description["environment_arguments"])
+        evaluator = Evaluator(description.environment, description.environment_arguments)
         try:
+            require_fit(policy, description.environment, evaluator.spec)
             result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
         finally:
             tell_of_closing([(0, error) for error in evaluator.close()], [run])
     return EvaluationResult(
-        description["environment"], episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
+        description.environment, episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
         result.total_rewards.tolist(), result.lengths.tolist(),
     )  # fmt: skip
+
+
+def require_seed(seed: int) -> None:
+    """Raise SettingError for what is no seed."""
+    require(0 <= seed < 2**63, "seed", seed, "use a whole number from 0 to 2**63 - 1")
+
+
+def require_fit(policy: TrainedPolicy, environment: str, spec: EnvironmentSpec) -> None:
+    """Raise UserError for a policy of another environment."""
+    for name in ("observation_size", "action_size"):
+        own, there = getattr(policy.spec, name), getattr(spec, name)
+        if own != there:
+            raise UserError(f"the policy is not one for {environment}: its {name} is {own}, and there it is {there}")
 
 
 def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Sequence[str] = ()) -> str:
@@ -73,12 +89,14 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
+    require_seed(seed)
     policy, description = load_policy(run), read_description(run)
     run, given, video = absolute(run), video, absolute(video)
-    require_import_allowed(description["environment"], imports)
+    require_import_allowed(description.environment, imports)
     with tracebacks_in([run]):
-        environment = filmed_environment(description["environment"], description["environment_arguments"], size)
+        environment = filmed_environment(description.environment, description.environment_arguments, size)
         try:
+            require_fit(policy, description.environment, environment.spec)
             environment.reset(seed)
             require_rendering(environment)
             total_reward, filmed = film_to(video, environment, policy, steps, seed)

@@ -6,6 +6,7 @@ This file imports no numerical library, so that `saclab --help` stays fast.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -154,6 +155,12 @@ def require_ranges(settings: AlgorithmSettings) -> None:
     for name, known in choices().items():
         value = getattr(settings, name)
         require(value in known, name, value, f"use one of {', '.join(map(str, known))}")
+
+    for name in field_names(type(settings)):
+        value = getattr(settings, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        finite = all(math.isfinite(number) for number in numbers if isinstance(number, float))
+        require(finite, name, value, "use finite numbers")
 
     def check(name: str, condition: Callable[[Any], bool], way_out: str) -> None:
         require(condition(getattr(settings, name)), name, getattr(settings, name), way_out)
@@ -304,11 +311,6 @@ def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settin
         if name not in known:
             raise unknown_name("setting", name, known)
     return dataclasses.replace(settings, **overrides)
-
-
-def algorithm_from_json(values: Mapping[str, Any]) -> AlgorithmSettings:
-    """The settings in a JSON object, where tuples are lists; raises SettingError for one that does not exist."""
-    return replace_settings(AlgorithmSettings(), values)
 
 
 @lru_cache(maxsize=1)

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
+import os
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import safetensors.numpy
 
 from saclab.algorithm.policy import make_policy
-from saclab.config import Config
+from saclab.config import Config, from_plain
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.files import replace_file, write_json
-from saclab.settings import AlgorithmSettings, algorithm_from_json
+from saclab.records import UNREADABLE, Damaged, PolicyDescription, read_bytes, read_json
+from saclab.settings import AlgorithmSettings
 
 ACTION_TYPES = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 ARRAYS, DESCRIPTION = "policy.safetensors", "policy.json"
+CHECKSUM = "checksum"
+"""An array among the others, u8[32]: in their file, so that a crash between the two files leaves a policy that is
+whole. Policies of before November 2026 have none."""
+RETRAIN = "train again, or resume the run if it is unfinished"
 
 
 class TrainedPolicy:
@@ -68,36 +76,39 @@ class TrainedPolicy:
 def save_policy(folder: Path, config: Config, spec: EnvironmentSpec, actor: np.ndarray, facts: dict[str, Any]) -> None:
     """Write a policy with what is needed to use it; `facts` are told beside it."""
     folder.mkdir(parents=True, exist_ok=True)
-    arrays = {"actor": actor, "action_low": spec.action_low, "action_high": spec.action_high}
-    replace_file(folder / ARRAYS, safetensors.numpy.save(arrays))
-    description = {
-        "environment": config.environment,
-        "environment_arguments": config.environment_arguments,
-        "observation_size": spec.observation_size,
-        "action_size": spec.action_size,
-        "algorithm": dataclasses.asdict(config.algorithm),
+    description = PolicyDescription(
+        environment=config.environment,
+        environment_arguments=config.environment_arguments,
+        observation_size=spec.observation_size,
+        action_size=spec.action_size,
+        algorithm=dataclasses.asdict(config.algorithm),
         **facts,
-    }
+    )
+    arrays = {"actor": actor, "action_low": spec.action_low, "action_high": spec.action_high}
+    arrays[CHECKSUM] = checksum(arrays, description)
+    replace_file(folder / ARRAYS, safetensors.numpy.save(arrays))
     write_json(folder / DESCRIPTION, description)
+
+
+def checksum(arrays: dict[str, np.ndarray], description: PolicyDescription) -> np.ndarray:
+    """SHA-256, u8[32], of the arrays and of what is needed to use them; not of the facts told beside them."""
+    used = msgspec.structs.replace(description, mean_return=None, episode=None)
+    content = safetensors.numpy.save(arrays) + json.dumps(msgspec.to_builtins(used), sort_keys=True).encode()
+    return np.frombuffer(hashlib.sha256(content).digest(), np.uint8)
 
 
 def policy_folder(run: Path) -> Path:
     """Where the policy of a run lies: `best` in a run folder, or the folder itself."""
-    return run / "best" if (run / "best").is_dir() else run
+    return run / "best" if os.path.isdir(run / "best") else run
 
 
-def read_description(run: Path) -> dict[str, Any]:
-    """policy.json: the environment the policy is for, and its settings; raises UserError if it is damaged."""
+def read_description(run: Path) -> PolicyDescription:
+    """policy.json: the environment the policy is for, and its settings; raises Damaged."""
     path = policy_folder(run) / DESCRIPTION
     try:
-        description: dict[str, Any] = json.loads(path.read_text())
-        if not isinstance(description["environment"], str) or not isinstance(
-            description["environment_arguments"], dict
-        ):
-            raise TypeError("it names no environment")
-    except (OSError, KeyError, RecursionError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is damaged ({error}): train again, or resume the run if it is unfinished") from error
-    return description
+        return read_json(path, PolicyDescription)
+    except Damaged as error:
+        raise Damaged(path, error.reason, RETRAIN) from error
 
 
 def load_policy(run: Path | str) -> TrainedPolicy:
@@ -107,24 +118,33 @@ def load_policy(run: Path | str) -> TrainedPolicy:
         UserError: if there is none, or its files are damaged.
     """
     folder = policy_folder(Path(run))
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise UserError(f"there is no folder {run}: give that of a run, or its best policy's")
-    if not (folder / ARRAYS).is_file():
+    if not os.path.lexists(folder / ARRAYS):
         raise UserError(f"{run} holds no policy yet: the first is kept after the run's first evaluation")
     description = read_description(folder)
     try:
-        arrays = safetensors.numpy.load((folder / ARRAYS).read_bytes())
-        settings = algorithm_from_json(description["algorithm"])
-        sizes = int(description["observation_size"]), int(description["action_size"])
+        arrays = safetensors.numpy.load(read_bytes(folder / ARRAYS))
+        require_checksum(arrays, description)
+        sizes = description.observation_size, description.action_size
         policy = TrainedPolicy(
-            settings, EnvironmentSpec(*sizes, arrays["action_low"], arrays["action_high"]), arrays["actor"]
-        )
+            from_plain(AlgorithmSettings, description.algorithm),
+            EnvironmentSpec(*sizes, arrays["action_low"], arrays["action_high"]), arrays["actor"],
+        )  # fmt: skip
         require_arrays(policy)
-    except (safetensors.SafetensorError, OSError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise UserError(
-            f"the policy in {folder} is damaged ({error}): train again, or resume the run if it is unfinished"
-        ) from error
+    except (safetensors.SafetensorError, AttributeError, KeyError, TypeError, UserError, *UNREADABLE) as error:
+        reason = error.reason if isinstance(error, Damaged) else error
+        raise UserError(f"the policy in {folder} is damaged ({reason}): {RETRAIN}") from error
     return policy
+
+
+def require_checksum(arrays: dict[str, np.ndarray], description: PolicyDescription) -> None:
+    """Raise ValueError for arrays that no policy has, or that are not those that were saved with this description."""
+    found = arrays.pop(CHECKSUM, None)
+    if unknown := arrays.keys() - {"actor", "action_low", "action_high"}:
+        raise ValueError(f"{ARRAYS} has an array {min(unknown)!r} that no policy has")
+    if found is not None and not np.array_equal(found, checksum(arrays, description)):
+        raise ValueError(f"{ARRAYS} and {DESCRIPTION} do not match their checksum")
 
 
 def require_arrays(policy: TrainedPolicy) -> None:

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from saclab.training.run_folder import read_run
+from saclab.trained_policy import load_policy, save_policy
+from saclab.training.run_folder import read_config, read_run
 
 SMALL = ("--random-steps", "200", "--batch-size", "32", "--hidden-layers", "16", "16", "--evaluation-episodes", "2")
 SHORT = (*SMALL, "--max-updates", "300", "--evaluation-interval-steps", "250", "--log-interval", "50")
@@ -226,8 +227,11 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
     run = tmp_path / "received"
     shutil.copytree(run_folder(trained), run)
     (run / "result.json").unlink()
-    for path in (run / "config.json", run / "best" / "policy.json"):
-        path.write_text(path.read_text().replace('"Pendulum-v1"', '"trap:Pendulum-v1"'))
+    shutil.rmtree(run / "checkpoints")  # an enemy's checksums would be right
+    path = run / "config.json"
+    path.write_text(path.read_text().replace('"Pendulum-v1"', '"trap:Pendulum-v1"'))
+    policy = load_policy(run)
+    save_policy(run / "best", read_config(run), policy.spec, policy.parameters, {})
     (tmp_path / "trap.py").write_text("open('sprung', 'w').close()")
     refused = saclab(command, str(run), folder=tmp_path)
     assert refused.returncode == 2
@@ -258,6 +262,13 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
         (("report", "nowhere"), "no run folder"),
         (("compare", "Pendulum-v1", "--variants", "sac", "nonsense"), "unknown variant 'nonsense'"),
         (("compare", "Pendulum-v1", "--seeds", "0"), "seeds = 0"),
+        (("evaluate", "nowhere", "--seed", "-1"), "seed = -1"),
+        (("record", "nowhere", "--seed", "-1"), "seed = -1"),
+        (("train", "Pendulum-v1", "--name", "x" * 300), "use at most 200 letters"),
+        (("resume", "x" * 300), "File name too long"),
+        (("report", "x" * 300), "File name too long"),
+        (("train", "Pendulum-v1", "--environment-arguments", '{"g": NaN}'), "not JSON"),
+        (("train", "Pendulum-v1", "--target-entropy", "nan"), "use finite numbers"),
     ],
 )
 def test_bad_input_gets_a_clear_line_and_status_2(tmp_path: Path, arguments: tuple[str, ...], expected: str) -> None:

@@ -158,7 +158,7 @@ def test_compare_trains_run_groups_and_each_run_has_its_own_place(tmp_path):
     for run in result.runs:
         assert (run.path / "best/policy.safetensors").exists()
         assert json.loads((run.path / "result.json").read_text())["updates"] == 300
-        assert read_last_session(run.path)["machine"]["batch"] == 4
+        assert read_last_session(run.path).machine.batch == 4
 
 
 def test_a_grid_begun_alone_goes_on_in_run_groups(tmp_path):

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 
 from saclab.algorithm.learner import metric_names
+from saclab.files import write_json
 from saclab.protocols import make_config
+from saclab.records import Result
 from saclab.settings import AlgorithmSettings
-from saclab.training.run_folder import EPISODE_COLUMNS, FORMAT, Q_BIAS_COLUMNS, evaluation_columns, run_path
+from saclab.training.logs import EPISODE_COLUMNS, Q_BIAS_COLUMNS, evaluation_columns
+from saclab.training.run_folder import FORMAT, run_path
 
 VERSIONS = {"saclab": "0.1.0", "jax": "0.10.2", "gymnasium": "1.4.0", "mujoco": "4.0.0", "python": "3.11.9"}
-TEST_EPISODES = 20
 METRICS = metric_names(AlgorithmSettings())
 
 
@@ -55,25 +57,35 @@ def write_run(
     count = evaluations if returns is None else len(returns)
     curve = level * (1 - np.exp(-np.arange(10 * count + 10) / (3.0 * count + 3)))
     curve = curve + generator.normal(0, 0.03 * abs(level), curve.shape) + generator.normal(0, 0.05 * abs(level))
-    write_evaluations(folder, generator, curve, count, returns)
+    write_evaluations(folder, generator, curve, count, returns, config.training.evaluation_episodes)
     write_episodes(folder, curve, 10 * count)
     write_metrics(folder, generator, curve, 10 * count, metrics, constants or {})
     write_q_bias(folder, count if q_bias else 0)
     if finished:
-        (folder / "result.json").write_text(json.dumps({"reason": "max_updates"}))
+        write_result(folder)
     return folder
 
 
-def write_evaluations(folder: Path, generator: Any, curve: np.ndarray, count: int, returns: list[float] | None) -> None:
+def write_result(folder: Path) -> None:
+    """What follows from the evaluations; its counters are made up."""
+    with (folder / "evaluations.csv").open() as file:
+        means = [float(row["mean_return"]) for row in csv.DictReader(file)]
+    result = Result("max_updates", 1000, 200, 10, max(means), means[-1], 2.0)
+    write_json(folder / "result.json", result)
+
+
+def write_evaluations(
+    folder: Path, generator: Any, curve: np.ndarray, count: int, returns: list[float] | None, episodes: int
+) -> None:
     with (folder / "evaluations.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(evaluation_columns(TEST_EPISODES))
+        writer.writerow(evaluation_columns(episodes))
         for index in range(count):
             episode = 10 * (index + 1)
-            each = curve[episode] + generator.normal(0, 100, TEST_EPISODES) if returns is None else returns[index]
-            each = np.broadcast_to(each, TEST_EPISODES)
+            each = curve[episode] + generator.normal(0, 100, episodes) if returns is None else returns[index]
+            each = np.broadcast_to(each, episodes)
             writer.writerow([index + 1, 1000 * episode, 200 * episode, episode, each.mean(), *each,
-                             *[1000] * TEST_EPISODES, 2.0 * episode])  # fmt: skip
+                             *[1000] * episodes, 2.0 * episode])  # fmt: skip
 
 
 def write_episodes(folder: Path, curve: np.ndarray, count: int) -> None:
@@ -93,7 +105,7 @@ def write_q_bias(folder: Path, count: int) -> None:
         for index in range(1, count + 1):
             writer.writerow({
                 "evaluation": index, "steps": 10_000 * index, "updates": 2000 * index, "episodes": 10 * index,
-                "mean_bias": 0.5 / index, "seconds": 20.0 * index,
+                "mean_bias": 0.5 / index, "pairs": 100, "seconds": 20.0 * index,
             })  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from saclab.training.run_folder import read_run
 
 from .synthetic import write_run
 
-HOSTILE = "</script><script>boom()</script><!--<img src=x onerror=boom()>\"'`|$\\frac{&amp;\ud800\u2028\x00"
+HOSTILE = "</script><script>boom()</script><!--<img src=x onerror=boom()>\"'`|$\\frac{&amp;\u2028\x00"
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -110,8 +110,9 @@ def test_without_evaluations_there_is_nothing_to_compare(tmp_path):
     assert environment_sentences(entry) == ["No run has an evaluation so far, so there is nothing to compare."]
 
 
-def test_returns_that_are_not_numbers_do_not_count(tmp_path):
-    folders = [write_run(tmp_path, "sac", 0, returns=[1.0, math.nan]), write_run(tmp_path, "sac", 1, returns=[2.0])]
+def test_a_run_with_returns_that_are_not_numbers_is_left_out(tmp_path):
+    folders = [write_run(tmp_path, "sac", 0, returns=[1.0, math.nan], finished=False),
+               write_run(tmp_path, "sac", 1, returns=[2.0])]  # fmt: skip
     assert [run.seed for run in scores_of(folders).arms[0].runs] == [1]
 
 

@@ -91,7 +91,7 @@ def without_seconds(path: Path) -> object:
             return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
     if path.suffix == ".jsonl":
         return [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in path.read_text().splitlines()]
-    return {key: value for key, value in json.loads(path.read_text()).items() if key != "seconds"}
+    return {key: value for key, value in json.loads(path.read_text()).items() if key not in ("seconds", "files")}
 
 
 NOT_COMPARED = {"sessions.jsonl", "worker.log", "lock"}
@@ -108,8 +108,8 @@ def fingerprint(folder: Path) -> dict[str, object]:
         found[name] = without_seconds(path) if plain else hashlib.sha256(path.read_bytes()).hexdigest()
     newest = newest_first(folder / "checkpoints")[0]
     manifest = read_manifest(newest)
-    del manifest["state"]["logs"], manifest["state"]["counters"]["seconds"]  # logs are longer by the digits of seconds
-    found[newest.name] = {"state": manifest["state"], "replay": manifest["replay"]}
+    del manifest.state["logs"], manifest.state["counters"]["seconds"]  # logs are longer by the digits of seconds
+    found[newest.name] = {"state": manifest.state, "replay": manifest.replay}
     for path in newest.glob("*.safetensors"):
         found[f"{newest.name}/{path.name}"] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found

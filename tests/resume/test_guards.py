@@ -33,7 +33,7 @@ def broken(config, folder: Path, steps_saved: int) -> tuple[str, dict, dict]:
     with request_at(steps_saved, requests, "save"), pytest.raises(NonFiniteError) as error:
         list(loop.train(config, folder, requests))
     kept = newest_first(folder / "checkpoints")
-    assert read_manifest(kept[0])["state"]["counters"]["steps"] == steps_saved
+    assert read_manifest(kept[0]).state["counters"]["steps"] == steps_saved
     assert f"{kept[0].name}, is kept" in str(error.value)
     assert str(folder / "failure") in str(error.value)
     assert not (folder / "result.json").exists()

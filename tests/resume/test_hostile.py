@@ -17,7 +17,8 @@ import pytest
 from saclab.errors import TrainingFailed, UserError
 from saclab.trained_policy import load_policy
 from saclab.training.checkpoint import CheckpointError
-from saclab.training.run_folder import LOGS, read_config
+from saclab.training.logs import LOGS
+from saclab.training.run_folder import read_config
 
 from .stage import FIRST, SECOND, change_arrays, newest, older, put, sign
 
@@ -190,9 +191,13 @@ def test_any_other_value_in_the_manifest_is_an_error_in_words(stage, folder, cou
 
 
 def test_any_other_value_in_the_configuration_is_read_or_refused(folder):
-    """Read as it stands, or refused with an error in words: never a traceback."""
+    """Read as it stands, or refused with an error in words: never a traceback. Checkpoints know what it was."""
     path = folder / "config.json"
     config = json.loads(path.read_text())
+    path.write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"config\.json is damaged \(it has \d+ bytes, and \d+ were written\)"):
+        read_config(folder)
+    shutil.rmtree(folder / "checkpoints")
     outcomes = {"read": 0, "refused": 0}
     for place in places(config):
         for new in [(), *((other,) for other in OTHERS)]:
@@ -204,7 +209,7 @@ def test_any_other_value_in_the_configuration_is_read_or_refused(folder):
             except UserError:
                 outcomes["refused"] += 1
                 continue
-            if new not in ((), ({},)):  # what is missing has its default
+            if new not in ((), ({},), (10**30,)):  # what is missing has its default; 10**30 is read as 1e30
                 assert read == changed["config"], place
     assert min(outcomes.values()) > 50, outcomes
 

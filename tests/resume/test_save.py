@@ -55,4 +55,4 @@ def test_any_number_of_signals_during_a_save_is_harmless(tmp_path, monkeypatch):
     monkeypatch.undo()
     saved = checkpoint.newest_first(tmp_path / "checkpoints")
     assert len(saved) == 1
-    assert checkpoint.read_manifest(saved[0])["state"]["counters"]["steps"] == 0
+    assert checkpoint.read_manifest(saved[0]).state["counters"]["steps"] == 0

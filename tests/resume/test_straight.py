@@ -34,7 +34,7 @@ def assert_exact(config, folder: Path) -> None:
     straight, broken = folder / "straight", folder / "broken"
     finish(config, straight)
     stop_at(HALF, config, broken)
-    state = read_manifest(newest_first(broken / "checkpoints")[0])["state"]
+    state = read_manifest(newest_first(broken / "checkpoints")[0]).state
     assert any(environment["length"] > 0 for environment in state["environments"])
     vanish_after(HALF + 30, config, broken)
     finish(config, broken)

@@ -18,7 +18,7 @@ def last_counters(folder: Path, checkpoint_minutes: float) -> dict[str, object]:
     config = make_config("Pendulum-v1", "sac", "quick", overrides=SETTINGS)
     for _ in train(config, folder, checkpoint_minutes=checkpoint_minutes):
         pass
-    counters = read_manifest(newest_first(folder / "checkpoints")[0])["state"]["counters"]
+    counters = read_manifest(newest_first(folder / "checkpoints")[0]).state["counters"]
     return {name: value for name, value in counters.items() if name != "seconds"}
 
 

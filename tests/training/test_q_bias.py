@@ -21,9 +21,10 @@ from saclab.environments.checked import CheckedEnvironment
 from saclab.errors import NonFiniteError
 from saclab.protocols import make_config
 from saclab.settings import AlgorithmSettings
+from saclab.training.logs import Q_BIAS_COLUMNS
 from saclab.training.loop import train
 from saclab.training.q_bias import Critics, Episode, QBias, known_returns, measure_q_bias
-from saclab.training.run_folder import Q_BIAS_COLUMNS, read_run
+from saclab.training.run_folder import read_run
 
 
 def episode(rewards: list[float], log_probs: list[float], terminated: bool) -> Episode:

@@ -83,6 +83,8 @@ class Report:
     """Run folders, or folders that hold some."""
     out: Path = Path("report")
     """Folder to write to."""
+    strict: bool = False
+    """Refuse if a folder cannot be read, in place of leaving it out."""
     allow_mixed: bool = False
     """Show runs that differ in more than variant, name and seed as well, labelled by what differs, never pooled."""
 
@@ -90,7 +92,10 @@ class Report:
         from saclab.report.report import write_report
         from saclab.training.run_folder import find_runs
 
-        page = write_report(find_runs(self.runs or (Path("runs"),)), self.out, allow_mixed=self.allow_mixed)
+        def tell(text: str) -> None:
+            console.print(text, soft_wrap=True, markup=False, highlight=False)
+
+        page = write_report(find_runs(self.runs or (Path("runs"),)), self.out, self.allow_mixed, self.strict, tell)
         console.print(f"report: {page.resolve()}", soft_wrap=True, markup=False)
         return 0
 

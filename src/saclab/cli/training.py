@@ -5,13 +5,13 @@ Nothing slow is imported before a command runs, so that `saclab --help` answers 
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import msgspec
 from tyro.conf import OmitArgPrefixes, Positional
 
 from saclab.config import Config
@@ -91,7 +91,7 @@ class Resume:
         from saclab.training.run_folder import read_config, read_last_session
 
         config = read_config(self.run)
-        limit_threads(self.threads or read_last_session(self.run)["machine"]["threads"])
+        limit_threads(self.threads or read_last_session(self.run).machine.threads)
         from saclab.environments.make import require_import_allowed
 
         require_import_allowed(config.environment, self.imports)
@@ -201,8 +201,8 @@ class Reproduce:
 def parse_arguments(text: str) -> dict[str, Any]:
     """Keyword arguments of an environment from JSON; raises SettingError for anything but an object."""
     try:
-        values = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        values = msgspec.json.decode(text.encode(errors="surrogatepass"))
+    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         raise SettingError("environment_arguments", text, f"not JSON ({error}); write '{{\"key\": 1.0}}'") from error
     if not isinstance(values, dict):
         raise SettingError("environment_arguments", text, "write a JSON object, such as '{\"key\": 1.0}'")

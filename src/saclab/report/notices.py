@@ -9,7 +9,7 @@ import numpy as np
 
 from saclab.report.arms import own_training
 from saclab.report.runs import Comparison
-from saclab.report.text import shown
+from saclab.report.text import count_text, shown
 from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord
 
@@ -53,13 +53,14 @@ def notices(runs: Sequence[RunRecord]) -> tuple[str, ...]:
 
 
 def all_notices(comparison: Comparison) -> tuple[str, ...]:
-    """The notices of every environment, each with its name if there are several."""
-    several = len(comparison.environments) > 1
-    return tuple(
+    """The notices of every environment, each with its name if there are several, and of what is left out."""
+    several, unreadable = len(comparison.environments) > 1, len(comparison.left_out)
+    told = [
         f"{shown(environment)}: {notice}" if several else notice
         for environment in comparison.environments
         for notice in notices(comparison.runs_of(environment))
-    )
+    ]
+    return (*told, *[f"{count_text(unreadable, 'folder')} left out that cannot be read"][:unreadable])
 
 
 def evaluations(run: RunRecord) -> int:

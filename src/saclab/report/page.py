@@ -10,10 +10,12 @@ import base64
 import hashlib
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from html import escape
 from importlib import resources
 from string import Template
 
+from saclab.records import Damaged, read_bytes
 from saclab.report.arms import Arm, own_name
 from saclab.report.curves import Curves
 from saclab.report.page_data import page_data
@@ -23,6 +25,7 @@ from saclab.report.runs import Comparison
 from saclab.report.scores import AggregateScores, EnvironmentScores
 from saclab.report.sentences import aggregate_sentences, environment_sentences
 from saclab.report.tables import (
+    LEFT_OUT,
     Table,
     arms_table,
     differences_table,
@@ -51,7 +54,8 @@ def make_page(
     style, script = read_data("report.css"), read_data("report.js")
     sections = [summary(comparison, scores, together)]
     sections += [environment_section(entry, number) for number, entry in enumerate(scores)]
-    sections += [together_section(together), videos(comparison, scores), settings(comparison, scores)]
+    sections += [together_section(together), videos(comparison, scores), left_out(comparison)]
+    sections += [settings(comparison, scores)]
     return Template(read_data("report.html")).substitute(
         style=style,
         script=script,
@@ -202,9 +206,12 @@ def videos(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str:
             if run is None:
                 continue
             size = (run.path / "best" / "video.mp4").stat().st_size
-            embed = size <= VIDEO_BYTES and spent + size <= ALL_VIDEO_BYTES
-            spent += size * embed
-            figures.append(video_html(entry.environment, arm, run, size, embed))
+            content = None
+            if size <= VIDEO_BYTES and spent + size <= ALL_VIDEO_BYTES:
+                with suppress(Damaged):
+                    content = read_bytes(run.path / "best" / "video.mp4")
+            spent += len(content or b"")
+            figures.append(video_html(entry.environment, arm, run, size, content))
     if not figures:
         return ""
     return f'<section id="videos"><h2>Best policies</h2><div class="charts">{"".join(figures)}</div></section>'
@@ -221,19 +228,18 @@ def best_return(run: RunRecord) -> float | None:
     return float(max(returns)) if len(returns) else None
 
 
-def video_html(environment: str, arm: Arm, run: RunRecord, size: int, embed: bool) -> str:
+def video_html(environment: str, arm: Arm, run: RunRecord, size: int, content: bytes | None) -> str:
     caption = escape(
         f"{arm.title} on {shown(environment)}, seed {run.config.seed}: the policy with the best evaluation return, "
         f"{best_return(run):,.0f}"
     )
-    if not embed:
+    if content is None:
         place = escape(shown("/".join(run.path.parts[-4:]), 200))
         too_large = f"Too large to embed ({size / 1e6:.1f} MB): {place}/best/video.mp4"
         return f"<figure><figcaption>{caption}. {too_large}</figcaption></figure>"
-    content = base64.b64encode((run.path / "best" / "video.mp4").read_bytes()).decode()
     return (
         f'<figure><video controls muted loop playsinline preload="metadata" aria-label="{caption}" '
-        f'src="data:video/mp4;base64,{content}"></video><figcaption>{caption}.</figcaption></figure>'
+        f'src="data:video/mp4;base64,{base64.b64encode(content).decode()}"></video><figcaption>{caption}.</figcaption></figure>'
     )
 
 
@@ -241,6 +247,13 @@ def settings(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str
     tables = [runs_table(comparison, scores), settings_table(comparison), versions_table(comparison)]
     parts = [f"<details><summary>{escape(table.title)}</summary>{table_html(table)}</details>" for table in tables]
     return f'<section id="settings"><h2>Runs, settings and versions</h2>{"".join(parts)}</section>'
+
+
+def left_out(comparison: Comparison) -> str:
+    """The folders that cannot be read, each with its reason."""
+    if not comparison.left_out:
+        return ""
+    return f'<section id="left-out"><h2>{LEFT_OUT}</h2>{bullets(comparison.left_out)}</section>'
 
 
 def commands(comparison: Comparison) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from saclab.errors import UserError
 from saclab.report.curves import gather_curves
 from saclab.report.figures import write_figures
 from saclab.report.notices import all_notices
@@ -14,35 +15,53 @@ from saclab.report.scores import aggregate, score_environment
 from saclab.report.tables import latex, markdown, scores_csv
 
 
-def write_report(runs: Sequence[Path], out: Path, allow_mixed: bool = False) -> Path:
+def write_report(
+    runs: Sequence[Path],
+    out: Path,
+    allow_mixed: bool = False,
+    strict: bool = False,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Path:
     """Compare runs and write index.html, report.md, scores.csv, table.tex and figures/*.png, *.svg into `out`.
 
-    Runs may be unfinished, or have no evaluation yet; the report says so.
+    Runs may be unfinished, or have no evaluation yet; the report says so. Folders that cannot be read are left out,
+    and listed with their reasons.
 
     Args:
         runs: run folders.
         out: folder of the report; made if it is missing, files of an earlier report are replaced.
         allow_mixed: show runs that are not comparable side by side, in place of refusing.
+        strict: refuse if a folder cannot be read, in place of leaving it out.
+        tell: takes a line for each folder that is left out.
 
     Returns:
         The path of index.html, one self-contained page.
 
     Raises:
-        UserError: for a folder that is not a run, runs that are not comparable, or two runs of one experiment and
-            seed.
+        UserError: if no folder can be read, for runs that are not comparable, two runs of one experiment and seed, or
+            a place that cannot be written to.
     """
-    comparison = read_comparison(runs, allow_mixed)
+    comparison = read_comparison(runs, allow_mixed, strict)
+    for reason in comparison.left_out:
+        tell(f"left out: {reason}")
     scores = [score_environment(comparison, environment) for environment in comparison.environments]
     together = aggregate(scores)
     curves = gather_curves(comparison)
     warnings = [*all_notices(comparison), *(f"Mixed on request: {difference}" for difference in comparison.mixed)]
-    out.mkdir(parents=True, exist_ok=True)
-    write_figures(comparison, scores, together, curves, out / "figures")
-    for name, text in {
+    texts = {
         "report.md": markdown(comparison, scores, warnings),
         "scores.csv": scores_csv(comparison, scores),
         "table.tex": latex(scores, warnings),
         "index.html": make_page(comparison, scores, together, curves, warnings),
-    }.items():
-        (out / name).write_text(text, encoding="utf-8")
+    }
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        write_figures(comparison, scores, together, curves, out / "figures")
+        for name, text in texts.items():
+            (out / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(
+            f"cannot write the report to {out}: {error.strerror or error}; name another folder (--out; --report of "
+            "saclab compare)"
+        ) from error
     return out / "index.html"

@@ -7,6 +7,7 @@ everything but the variant, or, where they have a name of their own, the setting
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -40,6 +41,8 @@ class Comparison(NamedTuple):
     """(environment, arm) -> runs in the order of their seeds. Not every arm need have runs everywhere."""
     mixed: tuple[str, ...]
     """The differences that were accepted, each a sentence; empty if all runs are comparable."""
+    left_out: tuple[str, ...] = ()
+    """Why folders could not be read, each a sentence."""
 
     def arms_of(self, environment: str) -> tuple[Arm, ...]:
         return tuple(arm for arm in self.arms if (environment, arm) in self.groups)
@@ -52,10 +55,32 @@ class Comparison(NamedTuple):
         return tuple(run for environment in self.environments for run in self.runs_of(environment))
 
 
-def read_comparison(folders: Sequence[Path], allow_mixed: bool = False) -> Comparison:
-    """Read run folders and group them; raises UserError as `read_run` and `group_runs` do."""
-    once = {folder.resolve(): folder for folder in folders}
-    return group_runs([read_run(folder) for folder in once.values()], allow_mixed)
+def read_comparison(folders: Sequence[Path], allow_mixed: bool = False, strict: bool = False) -> Comparison:
+    """Read run folders and group them.
+
+    Folders that cannot be read are left out.
+
+    Raises:
+        UserError: if none can be read, if one cannot and it is `strict`, and as `group_runs` does.
+    """
+    runs, left_out = read_runs(folders)
+    if left_out and (strict or not runs):
+        more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
+        raise UserError(f"{len(left_out)} of {len(runs) + len(left_out)} folders cannot be read: "
+                        f"{shown(next(iter(left_out.values())), 1000)}{more}")  # fmt: skip
+    return group_runs(runs, allow_mixed)._replace(left_out=tuple(shown(reason, 1000) for reason in left_out.values()))
+
+
+def read_runs(folders: Sequence[Path]) -> tuple[list[RunRecord], dict[Path, str]]:
+    """The runs of these folders, each once, and why the others cannot be read."""
+    runs: list[RunRecord] = []
+    left_out: dict[Path, str] = {}
+    for folder in {os.path.realpath(folder): folder for folder in folders}.values():
+        try:
+            runs.append(read_run(folder))
+        except UserError as error:
+            left_out[folder] = str(error)
+    return runs, left_out
 
 
 def group_runs(runs: Sequence[RunRecord], allow_mixed: bool = False) -> Comparison:

@@ -122,8 +122,7 @@ def score_environment(comparison: Comparison, environment: str) -> EnvironmentSc
 
 
 def has_score(run: RunRecord) -> bool:
-    """A run that diverged to returns that are not numbers has none."""
-    return evaluations(run) > 0 and bool(np.isfinite(run.evaluations["mean_return"]).all())
+    return evaluations(run) > 0
 
 
 def common_horizon(runs: Sequence[RunRecord]) -> float | None:

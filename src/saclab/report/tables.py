@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from saclab.config import flatten
+from saclab.records import csv_text
 from saclab.report.pairs import MEASURES, PairScores
 from saclab.report.paper import AVERAGED_CAVEAT, SOURCE
 from saclab.report.runs import Comparison
@@ -28,6 +27,7 @@ DIFFERENCES_NOTE = (
     "that a run of the first scores above one of the second, with its 95 % interval. Neither is corrected for the "
     "number of pairs."
 )
+LEFT_OUT = "Left out"
 CSV_COLUMNS = ("environment", "variant", "name", "differs", "protocol", "seed", "finished", "tests", "final", "best",
                "area", "steps_to_threshold", "threshold", "horizon_steps", "paper_best")  # fmt: skip
 
@@ -139,22 +139,20 @@ def runs_table(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> T
 
 def scores_csv(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str:
     """One line for each run with an evaluation, numbers in full."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(CSV_COLUMNS)
+    rows: list[Sequence[object]] = [CSV_COLUMNS]
     for entry in scores:
         for arm in entry.arms:
             records = {run.config.seed: run for run in comparison.groups[entry.environment, arm.arm]}
             for run in arm.runs:
                 record = records[run.seed]
                 protocol = shown(record.config.protocol)
-                writer.writerow([
+                rows.append([
                     shown(entry.environment), shown(arm.arm.variant), shown(arm.arm.own_name or arm.arm.variant),
                     arm.arm.settings_text, protocol, run.seed,
                     record.result is not None, run.evaluations, run.final, run.best, run.area, run.steps_to_threshold,
                     entry.threshold, entry.horizon, arm.paper_best,
                 ])  # fmt: skip
-    return text.getvalue()
+    return csv_text(rows)
 
 
 def markdown(comparison: Comparison, scores: Sequence[EnvironmentScores], warnings: Sequence[str]) -> str:
@@ -170,6 +168,8 @@ def markdown(comparison: Comparison, scores: Sequence[EnvironmentScores], warnin
     if (arms := arms_table(comparison)).rows:
         lines += ["", f"## {arms.title}", "", *markdown_table(arms)]
     lines += ["", "## Runs", "", *markdown_table(runs_table(comparison, scores))]
+    if comparison.left_out:
+        lines += ["", f"## {LEFT_OUT}", "", *(f"- {markdown_escape(reason)}" for reason in comparison.left_out)]
     return "\n".join(lines) + "\n"
 
 

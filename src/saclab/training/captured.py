@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from saclab.training.checkpoint import Arrays, CheckpointError
+from saclab.training.checkpoint import Arrays
+from saclab.training.manifest import CheckpointError
 
 
 def require_like(name: str, array: np.ndarray | None, expected: np.ndarray) -> np.ndarray:

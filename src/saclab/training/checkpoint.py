@@ -18,35 +18,33 @@ import errno
 import hashlib
 import json
 import os
-import re
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+import msgspec
 import numpy as np
 import safetensors.numpy
 
-from saclab.errors import TrainingFailed
 from saclab.files import sync, write_bytes
-from saclab.machine import available_memory
+from saclab.records import FileRecord, Manifest, ReplayRecord, file_record
 from saclab.replay import ReplayBuffer, RowLayout
 from saclab.training import format_1
+from saclab.training.manifest import (
+    FORMAT,
+    MANIFEST,
+    MANIFEST_CHECKSUM,
+    CheckpointError,
+    newest_first,
+    read_manifest,
+    read_plain_file,
+)
 
-FORMAT, OLDEST_FORMAT = 2, 1
 KEPT = 2
 SEGMENT_ROWS = 8192
-MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
-SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
-CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(-untested)?")
-MANIFEST_BYTES = 2**26  # far more than the plain state of a thousand environments
-LARGEST_COUNT = 2**53
 
 Arrays = dict[str, np.ndarray]
-
-
-class CheckpointError(TrainingFailed):
-    """A checkpoint could not be written, or none that is whole could be read."""
 
 
 class Checkpoint(NamedTuple):
@@ -132,17 +130,6 @@ def set_aside(checkpoint: Path, suffix: str) -> None:
     checkpoint.rename(checkpoint.with_suffix(suffix))
 
 
-def step_of(checkpoint: Path) -> int:
-    return int(checkpoint.name.split("-")[1])
-
-
-def newest_first(folder: Path) -> list[Path]:
-    """The finished checkpoints."""
-    found = [(match, path) for path in folder.glob("step-*") if (match := CHECKPOINT_NAME.fullmatch(path.name))]
-    found.sort(key=lambda pair: (int(pair[0][1]), pair[0][2] is None), reverse=True)
-    return [path for _, path in found]
-
-
 def replaced_by_next(folder: Path) -> Path | None:
     """The checkpoint that will be removed once the next one is written."""
     existing = newest_first(folder)
@@ -163,42 +150,34 @@ def write_files(folder: Path, checkpoint: Checkpoint, replay: Replay, link_from:
         for group, arrays in checkpoint.groups.items()
     }
     files |= write_replay(folder, replay, link_from)
-    manifest = {
-        "format": FORMAT,
-        "files": files,
-        "replay": {
-            "added": replay.added,
-            "capacity": replay.capacity,
-            "segment_rows": SEGMENT_ROWS,
-            "columns": replay.layout.columns,
-        },
-        "state": checkpoint.state,
-    }
-    content = json.dumps(manifest, indent=1).encode()
+    buffer = ReplayRecord(replay.added, replay.capacity, SEGMENT_ROWS, replay.layout.columns)
+    manifest = msgspec.to_builtins(Manifest(FORMAT, files, buffer, checkpoint.state))
+    content = json.dumps(manifest, indent=1, allow_nan=False).encode()
     write_bytes(folder / MANIFEST, content)
     write_bytes(folder / MANIFEST_CHECKSUM, (hashlib.sha256(content).hexdigest() + "\n").encode())
 
 
-def write_replay(folder: Path, replay: Replay, link_from: Path | None) -> dict[str, dict[str, Any]]:
+def write_replay(folder: Path, replay: Replay, link_from: Path | None) -> dict[str, FileRecord]:
     """Link the segments that `link_from` has already and write the others; `version` tells what a segment holds."""
     old_files = linkable_files(link_from)
     files = {}
     for index, rows in enumerate(segments(replay)):
         name = f"replay-{index:04d}.safetensors"
         version = segment_version(index, replay)
-        entry = old_files.get(name, {})
-        if link_from and entry.get("version") == version and linked(link_from / name, folder / name, entry["bytes"]):
+        entry = old_files.get(name)
+        if entry and entry.version == version and link_from and linked(link_from / name, folder / name, entry.bytes):
             files[name] = entry
         else:
-            files[name] = write_arrays(folder / name, {"rows": replay.rows[rows]}) | {"version": version}
+            files[name] = write_arrays(folder / name, {"rows": replay.rows[rows]})
+            files[name].version = version
     return files
 
 
-def linkable_files(folder: Path | None) -> dict[str, dict[str, Any]]:
+def linkable_files(folder: Path | None) -> dict[str, FileRecord]:
     """The files of a checkpoint by their manifest; none if there is no checkpoint or it is damaged."""
     try:
-        return read_manifest(folder)["files"] if folder else {}
-    except (CheckpointError, OSError):
+        return read_manifest(folder).files if folder else {}
+    except CheckpointError:
         return {}
 
 
@@ -231,71 +210,32 @@ def segment_version(index: int, replay: Replay) -> int:
     return newest - (position - last_of_segment) % replay.capacity
 
 
-def write_arrays(path: Path, arrays: Arrays) -> dict[str, Any]:
+def write_arrays(path: Path, arrays: Arrays) -> FileRecord:
     """Write a safetensors file; its manifest entry."""
     content = safetensors.numpy.save({name: np.array(array, order="C") for name, array in arrays.items()})
     write_bytes(path, content)
-    return {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    return file_record(content)
 
 
 # --- reading: every value is checked before it is used, as the folder may come from anywhere
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest, checked against its own checksum, every entry of the type that `write_files` gives it."""
-    content = read_plain_file(folder / MANIFEST, MANIFEST_BYTES)
-    expected = read_plain_file(folder / MANIFEST_CHECKSUM, 2 * len(hashlib.sha256().hexdigest()))
-    if hashlib.sha256(content).hexdigest() != expected.decode(errors="replace").strip():
-        raise CheckpointError(f"{MANIFEST} does not match its checksum")
-    try:
-        manifest = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{MANIFEST} is not JSON: {error}") from error
-    if not isinstance(manifest, dict):
-        raise CheckpointError(f"{MANIFEST} is not what saclab writes")
-    found = manifest.get("format")
-    if type(found) is not int or not OLDEST_FORMAT <= found <= FORMAT:
-        raise CheckpointError(
-            f"it has format {found!r}, and this version of saclab reads formats {OLDEST_FORMAT} to {FORMAT}"
-        )
-    require_parts(manifest)
-    return manifest
-
-
-def require_parts(manifest: dict[str, Any]) -> None:
-    for part in ("files", "replay", "state"):
-        if not isinstance(manifest.get(part), dict):
-            raise CheckpointError(f"the entry {part!r} of its manifest is not what saclab writes")
-    for name, entry in manifest["files"].items():
-        if not SAFE_FILE.fullmatch(name):
-            raise CheckpointError(f"its manifest names a file {name!r} that no checkpoint has")
-        if not isinstance(entry, dict) or not is_count(entry.get("bytes")) or not isinstance(entry.get("sha256"), str):
-            raise CheckpointError(f"its manifest has no size and checksum for {name}")
-    for name in ("added", "capacity", "segment_rows"):
-        if not is_count(manifest["replay"].get(name)):
-            raise CheckpointError(f"its manifest has {name} = {manifest['replay'].get(name)!r} for the replay buffer")
-
-
-def is_count(value: object) -> bool:
-    return type(value) is int and 0 <= value < LARGEST_COUNT
-
-
 def read_checkpoint(folder: Path, replay: ReplayBuffer) -> Checkpoint:
     """Read and check every file; raises CheckpointError if one is not as it was written."""
     manifest = read_manifest(folder)
-    buffer = manifest["replay"]
-    if buffer["capacity"] != replay.capacity:
-        raise CheckpointError(f"its replay capacity is {buffer['capacity']}, not {replay.capacity}")
+    buffer = manifest.replay
+    if buffer.capacity != replay.capacity:
+        raise CheckpointError(f"its replay capacity is {buffer.capacity}, not {replay.capacity}")
     columns = replay.layout.columns
-    if manifest["format"] > 1 and buffer.get("columns") != columns:
-        raise CheckpointError(f"the columns of its transitions are {buffer.get('columns')!r}, not {columns}")
-    size, length = min(buffer["added"], replay.capacity), max(1, buffer["segment_rows"])
+    if manifest.format > 1 and buffer.columns != columns:
+        raise CheckpointError(f"the columns of its transitions are {buffer.columns!r}, not {columns}")
+    size, length = min(buffer.added, replay.capacity), max(1, buffer.segment_rows)
     starts = {f"replay-{index:04d}.safetensors": start for index, start in enumerate(range(0, size, length))}
-    replay_files = {name for name in manifest["files"] if name.startswith("replay-")}
+    replay_files = {name for name in manifest.files if name.startswith("replay-")}
     if replay_files != starts.keys():
         raise CheckpointError(f"its replay files are not those of {size} transitions in segments of {length}")
     groups = {}
-    for name, entry in manifest["files"].items():
+    for name, entry in manifest.files.items():
         arrays = read_arrays(folder, name, entry)
         if name in starts:
             rows, start = arrays.get("rows"), starts[name]
@@ -305,32 +245,20 @@ def read_checkpoint(folder: Path, replay: ReplayBuffer) -> Checkpoint:
             replay.rows[start : start + len(rows)] = rows
         else:
             groups[name.removesuffix(".safetensors")] = arrays
-    replay.added = buffer["added"]
-    if manifest["format"] == 1:
+    replay.added = buffer.added
+    if manifest.format == 1:
         groups["learner"] = format_1.today(groups.get("learner", {}))
-    return Checkpoint(groups, manifest["state"], replay.added, manifest["format"])
+    return Checkpoint(groups, manifest.state, replay.added, manifest.format)
 
 
-def read_arrays(folder: Path, name: str, entry: dict[str, Any]) -> Arrays:
+def read_arrays(folder: Path, name: str, entry: FileRecord) -> Arrays:
     """The arrays of a file, once its size and checksum are those of its manifest entry."""
-    size = entry["bytes"]
+    size = entry.bytes
     content = read_plain_file(folder / name, size)
-    if len(content) != size or hashlib.sha256(content).hexdigest() != entry["sha256"]:
+    if len(content) != size or hashlib.sha256(content).hexdigest() != entry.sha256:
         raise CheckpointError(f"{name} does not match its checksum")
     try:
         arrays: Arrays = safetensors.numpy.load(content)
     except (safetensors.SafetensorError, AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{name} is not a safetensors file: {error}") from error
     return arrays
-
-
-def read_plain_file(path: Path, limit: int) -> bytes:
-    """A file of at most `limit` bytes, which memory must hold; never a link, a pipe or a device."""
-    if path.is_symlink() or not path.is_file():
-        raise CheckpointError(f"{path.name} is missing")
-    size, available = path.stat().st_size, available_memory()
-    if size > limit:
-        raise CheckpointError(f"{path.name} has {size} bytes, more than the {limit} that were written")
-    if available is not None and size > available:
-        raise CheckpointError(f"{path.name} has {size} bytes, and {available} bytes of memory are free")
-    return path.read_bytes()

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from saclab.replay import ReplayBuffer
-from saclab.training.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    newest_first,
-    read_checkpoint,
-    read_manifest,
-    set_aside,
-    step_of,
-)
+import msgspec
 
-LARGEST_GROUP = 4096
+from saclab.records import Damaged, Facts, read_json
+from saclab.replay import ReplayBuffer
+from saclab.training.checkpoint import Checkpoint, read_checkpoint, set_aside
+from saclab.training.manifest import CheckpointError, newest_first, read_manifest, step_of
 
 
 def checkpoint_steps(run: Path) -> list[int]:
@@ -29,18 +22,11 @@ def checkpoint_steps(run: Path) -> list[int]:
 def group_slots(run: Path) -> int:
     """Slots of the run group in which a run was saved last, or begun; 0 if it was not begun, or is alone."""
     for path in newest_first(run / "checkpoints"):
-        with suppress(CheckpointError, OSError):
-            return slots_among(read_manifest(path)["state"].get("facts"))
-    with suppress(OSError, ValueError, RecursionError):
-        return slots_among(json.loads((run / "config.json").read_text()))
+        with suppress(CheckpointError, msgspec.ValidationError):
+            return msgspec.convert(read_manifest(path).state.get("facts"), Facts).machine.batch
+    with suppress(Damaged):
+        return read_json(run / "config.json", Facts).machine.batch
     return 0
-
-
-def slots_among(facts: object) -> int:
-    """The slots in what `machine_facts` gave, if that is what it is."""
-    machine = facts.get("machine") if isinstance(facts, dict) else None
-    slots = machine.get("batch") if isinstance(machine, dict) else None
-    return slots if type(slots) is int and 0 <= slots <= LARGEST_GROUP else 0
 
 
 def load_newest_checkpoint(folder: Path, replay: ReplayBuffer, warn: Callable[[str], None]) -> Checkpoint | None:

@@ -16,8 +16,9 @@ from saclab.environments.vector import EndedEpisode
 from saclab.errors import RunBroken
 from saclab.files import same_directory
 from saclab.replay import RowLayout
-from saclab.training.checkpoint import Checkpoint, CheckpointError
+from saclab.training.checkpoint import Checkpoint
 from saclab.training.evaluation import EvaluationEpisodes
+from saclab.training.manifest import CheckpointError
 from saclab.training.q_bias import QBias
 from saclab.training.run_state import RunState
 from saclab.training.snapshot import EnvironmentStates, Snapshot, Start, new_start

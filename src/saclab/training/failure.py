@@ -13,8 +13,8 @@ import safetensors.numpy
 from saclab.environments.watch import log
 from saclab.errors import RunBroken, TrainingFailed, UserError, for_terminal
 from saclab.files import replace_file, write_json
-from saclab.training.checkpoint import newest_first
 from saclab.training.learners import named_leaves
+from saclab.training.manifest import newest_first
 from saclab.training.run_folder import FAILURE
 from saclab.training.snapshot import Snapshot
 

@@ -12,44 +12,62 @@ failure/             what led to its end, if it came to a bad one
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from saclab.config import Config
 from saclab.errors import UserError
+from saclab.records import (
+    EPISODES,
+    EVALUATIONS,
+    JSON_BYTES,
+    METRICS,
+    Q_BIAS,
+    Count,
+    Damaged,
+    FileRecord,
+    Formatted,
+    Missing,
+    Result,
+    RunDescription,
+    Session,
+    Table,
+    from_json,
+    read_bytes,
+    read_json,
+    require_recorded,
+    table_from_csv,
+    table_from_json_lines,
+)
+from saclab.settings import require
+from saclab.training.logs import evaluation_columns
+from saclab.training.manifest import CheckpointError, newest_first, read_manifest
 
 FORMAT = 1
+LONGEST_NAME = 200
+"""Letters of a folder's name that every file system takes."""
 FAILURE = "failure"
 """Folder with what led to a run's end, if it came to a bad one."""
-LOGS = ("metrics.jsonl", "episodes.csv", "evaluations.csv", "q_bias.csv")
-EPISODE_COLUMNS = ("episode", "steps", "updates", "return", "running_average", "length", "terminated", "seconds")
-"""`episode` counts from 1 after the random steps; episodes that ended within them have number 0."""
-Q_BIAS_COLUMNS = (
-    "evaluation", "steps", "updates", "episodes", "pairs", "mean_q", "mean_return", "mean_bias", "bias_spread",
-    "seconds",
-)  # fmt: skip
-"""From `pairs` on, the fields of `saclab.training.q_bias.QBias`."""
-
-
-def evaluation_columns(episodes: int) -> tuple[str, ...]:
-    """`seconds` is wall-clock time, here as in every log: the only entry that differs between equal runs."""
-    returns = [f"return_{index}" for index in range(episodes)]
-    lengths = [f"length_{index}" for index in range(episodes)]
-    return ("evaluation", "steps", "updates", "episodes", "mean_return", *returns, *lengths, "seconds")
+EVALUATION_TYPES = {"return_": float, "length_": Count}
+"""Of the numbered columns of evaluations.csv."""
+ROUNDED = 1e-4
+"""What is computed from logs may differ from what is recorded by such a share: logs may be rounded to five digits."""
 
 
 def run_path(root: Path, config: Config, name: str | None = None) -> Path:
     """runs/<environment>/<variant or name>/<protocol>/seed-<n>."""
-    parts = (config.environment, name or config.variant, config.protocol, f"seed-{config.seed}")
-    return root.joinpath(*(safe_name(part) for part in parts))
+    parts = {"environment": config.environment, "name": name or config.variant, "protocol": config.protocol}
+    for setting, part in parts.items():
+        require(len(safe_name(part)) <= LONGEST_NAME, setting, part, f"use at most {LONGEST_NAME} letters")
+    return root.joinpath(*map(safe_name, parts.values()), f"seed-{config.seed}")
 
 
 def safe_name(text: str) -> str:
@@ -58,58 +76,34 @@ def safe_name(text: str) -> str:
 
 
 def read_config(run: Path) -> Config:
-    """The configuration of a run folder; raises UserError if it is not one."""
-    return config_of(run, read_config_file(run))
+    """The configuration of a run folder; raises UserError if it is not one, or is not the one that was recorded."""
+    return config_of(run, read_description(run, recorded_files(run)))
 
 
-def config_of(run: Path, content: dict[str, Any]) -> Config:
-    """The configuration in what `read_config_file` read; raises UserError if there is none that works."""
-    try:
-        config = Config.from_dict(content["config"])
-    except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise damaged(run / "config.json", error) from error
-    for settings in (config, config.algorithm, config.training):
-        for name, hint in get_type_hints(type(settings)).items():
-            value = getattr(settings, name)
-            if not fits(value, hint):
-                raise damaged(run / "config.json", f"{name} = {value!r}")
-    return config
-
-
-def fits(value: object, hint: Any) -> bool:
-    """Whether a value that came from JSON is of the type of a setting."""
-    kind, arguments = get_origin(hint), get_args(hint)
-    if kind is Literal:
-        return value in arguments
-    if kind is tuple:
-        return isinstance(value, tuple) and all(fits(part, arguments[0]) for part in value)
-    if kind in (Union, UnionType):
-        return any(fits(value, argument) for argument in arguments)
-    if hint is float:
-        return type(value) in (int, float)
-    return type(value) is (kind or hint)
-
-
-def damaged(path: Path, reason: object) -> UserError:
-    return UserError(f"{path} is damaged ({reason}): restore it, or remove the folder and train again")
-
-
-def read_config_file(run: Path) -> dict[str, Any]:
+def read_description(run: Path, recorded: Mapping[str, FileRecord]) -> RunDescription:
+    """config.json; raises UserError if it is none of saclab's, Damaged if it is not what was recorded of it."""
     path = run / "config.json"
-    if not path.is_file():
-        raise UserError(f"{run} is not a run folder: it has no config.json")
     try:
-        content: dict[str, Any] = json.loads(path.read_text())
-    except (ValueError, RecursionError) as error:
-        raise damaged(path, error) from error
-    if not isinstance(content, dict) or "format" not in content:
-        raise damaged(path, "it is not what saclab writes")
-    if content["format"] != FORMAT:
-        raise UserError(f"{path} has format {content.get('format')!r}, and this version of saclab reads {FORMAT}")
-    for part in ("config", "versions", "machine"):
-        if not isinstance(content.get(part), dict):
-            raise damaged(path, f"it has no {part}")
-    return content
+        content = read_bytes(path, JSON_BYTES)
+    except Missing as error:
+        raise UserError(f"{run} is not a run folder: it has no config.json") from error
+    if path.name in recorded:
+        require_recorded(path, content, recorded[path.name], grows=False)
+    try:
+        found = from_json(path, content, Formatted).format
+    except Damaged as error:
+        raise UserError(f"{run} is not a run folder: its config.json is not saclab's ({error.reason})") from error
+    if found != FORMAT:
+        raise UserError(f"{path} has format {found!r}, and this version of saclab reads {FORMAT}")
+    return from_json(path, content, RunDescription)
+
+
+def config_of(run: Path, description: RunDescription) -> Config:
+    """The configuration in config.json; raises Damaged if there is none that works."""
+    try:
+        return Config.from_dict(description.config)
+    except (msgspec.ValidationError, UserError) as error:
+        raise Damaged(run / "config.json", error) from error
 
 
 def append_line(path: Path, value: object) -> None:
@@ -118,93 +112,64 @@ def append_line(path: Path, value: object) -> None:
         end = file.seek(0, os.SEEK_END)
         file.seek(max(0, end - 1))
         torn = file.read(1) not in (b"", b"\n")
-        file.write(b"\n" * torn + json.dumps(value).encode() + b"\n")
+        file.write(b"\n" * torn + json.dumps(value, allow_nan=False).encode() + b"\n")
 
 
-def read_last_session(run: Path) -> dict[str, Any]:
-    """The facts of the last session that worked on a run; those of its making if it has no session yet.
+def read_last_session(run: Path) -> Session:
+    """The last session that worked on a run; that of its making if it has none yet. Its machine has threads.
 
-    Its `machine` has `threads`. Lines that a crash or anything else has damaged are passed over.
+    Lines that a crash or anything else has damaged are passed over. Raises Damaged if nothing tells the threads.
     """
-    path = run / "sessions.jsonl"
-    for line in reversed(path.read_bytes().splitlines() if path.is_file() else []):
-        try:
-            session = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if has_threads(session):
-            return dict(session)
-    content = read_config_file(run)
-    if not has_threads(content):
-        raise damaged(run / "config.json", "it does not tell the machine's threads")
-    return content
+    path, lines = run / "sessions.jsonl", []
+    with suppress(Damaged):
+        lines = read_bytes(path).splitlines()
+    for line in reversed(lines):
+        with suppress(Damaged):
+            session = from_json(path, line, Session)
+            if session.machine.threads is not None:
+                return session
+    session = read_json(run / "config.json", Session)
+    if session.machine.threads is None:
+        raise Damaged(run / "config.json", "it does not tell the machine's threads")
+    return session
 
 
-def has_threads(session: object) -> bool:
-    machine = session.get("machine") if isinstance(session, dict) else None
-    threads = machine.get("threads") if isinstance(machine, dict) else None
-    return type(threads) is int and threads > 0
+# --- what is recorded of the files, so that damage is seen
 
 
 def is_finished(run: Path) -> bool:
-    return (run / "result.json").is_file()
+    return os.path.isfile(run / "result.json")
 
 
-class Logs:
-    """The growing files of a run; their lengths are part of a checkpoint."""
+def read_result(run: Path) -> Result | None:
+    """result.json; None for a run that has not finished. Raises Damaged."""
+    try:
+        return read_json(run / "result.json", Result)
+    except Missing:
+        return None
 
-    def __init__(self, run: Path, evaluation_episodes: int, positions: dict[str, int] | None) -> None:
-        """Open for appending, cut back to `positions`, or start anew with header lines if there are none."""
-        self.files = {}
-        headers = {
-            "episodes.csv": ",".join(EPISODE_COLUMNS) + "\n",
-            "evaluations.csv": ",".join(evaluation_columns(evaluation_episodes)) + "\n",
-            "metrics.jsonl": "",
-            "q_bias.csv": ",".join(Q_BIAS_COLUMNS) + "\n",
-        }
-        for name in LOGS:
-            file = (run / name).open("r+" if (run / name).exists() else "w+", newline="")
-            position = 0 if positions is None else positions.get(name, 0)
-            if os.fstat(file.fileno()).st_size < position:
-                raise UserError(
-                    f"{run / name} is shorter than the checkpoint remembers, so the run cannot be continued: restore "
-                    "the file, or remove the folder and train again"
-                )
-            file.truncate(position)
-            file.seek(position)
-            if position == 0:
-                file.write(headers[name])
-                file.flush()
-            self.files[name] = file
 
-    def episode(self, *row: object) -> None:
-        csv.writer(self.files["episodes.csv"], lineterminator="\n").writerow(row)
+def recorded_files(run: Path) -> dict[str, FileRecord]:
+    """What is known of config.json and the logs: from the end of a run, or from its newest checkpoint.
 
-    def evaluation(self, *row: object) -> None:
-        csv.writer(self.files["evaluations.csv"], lineterminator="\n").writerow(row)
-        self.flush()
+    Empty where nothing is: before the first checkpoint, and for runs of before November 2026.
+    """
+    result = read_result(run)
+    if result is not None and result.files:
+        return result.files
+    for path in newest_first(run / "checkpoints"):
+        with suppress(CheckpointError):
+            return files_in(read_manifest(path).state)
+    return {}
 
-    def q_bias(self, *row: object) -> None:
-        csv.writer(self.files["q_bias.csv"], lineterminator="\n").writerow(row)
 
-    def metrics(self, values: dict[str, float | int]) -> None:
-        self.files["metrics.jsonl"].write(json.dumps(values) + "\n")
-        self.flush()
-
-    def flush(self) -> None:
-        for file in self.files.values():
-            file.flush()
-
-    def positions(self) -> dict[str, int]:
-        """Lengths in bytes, once everything is on its way to the disk."""
-        self.flush()
-        for file in self.files.values():
-            os.fsync(file.fileno())
-        return {name: os.fstat(file.fileno()).st_size for name, file in self.files.items()}
-
-    def close(self) -> None:
-        for file in self.files.values():
-            file.close()
+def files_in(state: Mapping[str, Any]) -> dict[str, FileRecord]:
+    """What a checkpoint's state records of files; older ones have the logs' lengths only. Raises CheckpointError."""
+    try:
+        found = msgspec.convert(state.get("logs"), dict[str, Count | FileRecord])
+    except msgspec.ValidationError as error:
+        raise CheckpointError(f"the checkpoint's entry 'logs' is not what saclab writes: {error}") from error
+    return {name: FileRecord(entry) if isinstance(entry, int) else entry for name, entry in found.items()}
 
 
 class RunRecord(NamedTuple):
@@ -227,65 +192,105 @@ class RunRecord(NamedTuple):
 
 
 def read_run(run: Path) -> RunRecord:
-    """Read a run folder, finished or not; raises UserError if it is not one or a file in it is damaged."""
-    content = read_config_file(run)
-    evaluations = readable(read_csv, run / "evaluations.csv")
-    for field, prefix in (("returns", "return_"), ("lengths", "length_")):
-        columns = [evaluations.pop(name) for name in list(evaluations) if name.startswith(prefix)]
-        evaluations[field] = np.stack(columns, axis=1) if columns else np.zeros((0, 0))
-    episodes = readable(read_csv, run / "episodes.csv")
+    """Read a run folder, finished or not.
+
+    Raises:
+        UserError: if it is not one, or a file in it is damaged: what was recorded of the logs, and what follows from
+            other numbers, is compared.
+    """
+    result, recorded = read_result(run), recorded_files(run)
+    description = read_description(run, recorded)
+    config = config_of(run, description)
+
+    def log(name: str) -> bytes:
+        return read_log(run / name, recorded.get(name), grows=result is None)
+
+    evaluations = table_from_csv(run / "evaluations.csv", log("evaluations.csv"), EVALUATIONS, EVALUATION_TYPES)
+    evaluations = with_matrices(run / "evaluations.csv", evaluations, config.training.evaluation_episodes)
+    require_consistent(run, evaluations, result)
+    episodes = table_from_csv(run / "episodes.csv", log("episodes.csv"), EPISODES)
     if episodes:
         learning = episodes["episode"] > 0
         episodes = {name: column[learning] for name, column in episodes.items()}
     return RunRecord(
         path=run,
-        config=config_of(run, content),
-        versions=content["versions"],
-        machine=content["machine"],
+        config=config,
+        versions=description.versions,
+        machine=description.machine,
         evaluations=evaluations,
         episodes=episodes,
-        metrics=readable(read_json_lines, run / "metrics.jsonl"),
-        q_bias=readable(read_csv, run / "q_bias.csv"),
-        result=readable(read_json, run / "result.json") if is_finished(run) else None,
+        metrics=table_from_json_lines(run / "metrics.jsonl", log("metrics.jsonl"), METRICS),
+        q_bias=table_from_csv(run / "q_bias.csv", log("q_bias.csv"), Q_BIAS),
+        result=None if result is None else msgspec.to_builtins(result),
     )
 
 
-def readable(read: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any]:
-    """What `read` makes of a file; raises UserError if it cannot."""
+def read_log(path: Path, recorded: FileRecord | None, grows: bool) -> bytes:
+    """A log; nothing if there is none and nothing is recorded of it. Raises Damaged."""
     try:
-        return read(path)
-    except (KeyError, RecursionError, TypeError, ValueError) as error:
-        raise damaged(path, error) from error
+        content = read_bytes(path)
+    except Missing:
+        if recorded is None:
+            return b""
+        raise
+    if recorded is not None:
+        require_recorded(path, content, recorded, grows)
+    return content
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    return dict(json.loads(path.read_text()))
+def with_matrices(path: Path, evaluations: Table, episodes: int) -> Table:
+    """The columns of evaluations.csv, those of the single episodes put together as [n, episodes]."""
+    if not evaluations:
+        return {"returns": np.zeros((0, 0)), "lengths": np.zeros((0, 0))}
+    if lacking := [name for name in evaluation_columns(episodes) if name not in evaluations]:
+        raise Damaged(path, f"it has no column {lacking[0]!r}")
+    table = dict(evaluations)
+    for field, prefix in (("returns", "return_"), ("lengths", "length_")):
+        table[field] = np.stack([table.pop(f"{prefix}{index}") for index in range(episodes)], axis=1)
+    return table
 
 
-def read_csv(path: Path) -> dict[str, np.ndarray]:
-    """Columns as f64 arrays; a last line that is not whole, of a run that is being written, is left out."""
-    if not path.is_file():
-        return {}
-    whole = path.read_text().rpartition("\n")[0]
-    if not whole:
-        return {}
-    header, *rows = csv.reader(whole.splitlines())
-    table = np.array([[float(value) for value in row] for row in rows], np.float64).reshape(len(rows), len(header))
-    return {name: table[:, index] for index, name in enumerate(header)}
+def require_consistent(run: Path, evaluations: Table, result: Result | None) -> None:
+    """Raise Damaged unless every evaluation is there, and its mean is that of its episodes.
 
-
-def read_json_lines(path: Path) -> dict[str, np.ndarray]:
-    """Columns as f64 arrays; a last line that is not whole is left out."""
-    if not path.is_file():
-        return {}
-    lines = [json.loads(line) for line in path.read_text().rpartition("\n")[0].splitlines()]
-    return {name: np.array([line[name] for line in lines], np.float64) for name in (lines[0] if lines else ())}
+    A finished run's best and last returns are compared too: they are all that tells of a log of before checksums.
+    """
+    path = run / "evaluations.csv"
+    if not evaluations["returns"].size:
+        if result is not None:
+            raise Damaged(path, "the run has finished, and there is no evaluation")
+        return
+    means, returns = evaluations["mean_return"], evaluations["returns"]
+    if not np.array_equal(evaluations["evaluation"], np.arange(1, len(means) + 1)):
+        raise Damaged(path, "its evaluations are not numbered 1, 2, 3, …")
+    for name in ("steps", "updates", "episodes"):
+        if (np.diff(evaluations[name]) < 0).any():
+            raise Damaged(path, f"its {name} go back")
+    tolerance = ROUNDED * np.abs(returns).max(axis=1)
+    if (np.abs(means - returns.mean(axis=1)) > tolerance).any():
+        raise Damaged(path, "a mean_return is not the mean of its episodes' returns")
+    ends = (
+        {} if result is None else {"best": (result.best_return, means.max()), "last": (result.final_return, means[-1])}
+    )
+    for name, (told, found) in ends.items():
+        if abs(told - found) > tolerance.max():
+            raise Damaged(path, f"its {name} mean_return is {found:g}, and result.json has {told:g}")
 
 
 def find_runs(roots: Iterable[Path]) -> list[Path]:
-    """All run folders at or below the given ones, sorted; raises UserError if there is none."""
-    roots = list(roots)
-    runs = sorted({path.parent for root in roots for path in root.rglob("config.json")})
+    """All run folders at or below the given ones, sorted, and folders that cannot be looked into.
+
+    Raises UserError if there is none.
+    """
+    roots, runs = list(roots), set[Path]()
+    problems: list[OSError] = []
+    for root in roots:
+        for folder, folders, files in os.walk(root, onerror=problems.append):
+            if "config.json" in (*folders, *files):
+                runs.add(Path(folder))
+            folders[:] = [name for name in folders if name != "checkpoints"]
+    runs |= {Path(problem.filename) for problem in problems} - set(roots)
     if not runs:
-        raise UserError(f"no run folder (one with a config.json) in {', '.join(map(str, roots))}")
-    return runs
+        reasons = "".join(f"; {problem.filename}: {problem.strerror}" for problem in problems)
+        raise UserError(f"no run folder (one with a config.json) in {', '.join(map(str, roots))}{reasons}")
+    return sorted(runs)

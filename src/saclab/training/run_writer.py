@@ -10,15 +10,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
 from saclab.files import write_json
+from saclab.records import FileRecord, Result, file_record, read_bytes
 from saclab.trained_policy import load_policy, save_policy
 from saclab.training.checkpoint import save_checkpoint
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.events import EpisodeEnded, Evaluated, Event, Finished, Progress, Saved, UpdatesLogged, Warned
+from saclab.training.logs import Logs
 from saclab.training.q_bias import QBias
-from saclab.training.run_folder import Logs, append_line
+from saclab.training.run_folder import append_line
 from saclab.training.snapshot import EnvironmentStates, Snapshot, to_checkpoint
 from saclab.training.starts import Beginning
 
@@ -38,14 +42,15 @@ class RunWriter:
             facts: what may decide the result's last bits, from `machine_facts`.
 
         Raises:
-            UserError: if a log is shorter than the checkpoint remembers.
+            Damaged: if a log does not begin with what the checkpoint has recorded of it.
         """
         self.run, self.notes = beginning.start.run, beginning.notes
         self.spec, self.folder, self.facts = spec, folder, facts
         self.warned_of_temperature = self.policy_was_read = False
         self.resumed_at_step = self.run.counters.steps
         self._write_best()
-        self.logs = Logs(folder, self.run.config.training.evaluation_episodes, beginning.log_lengths)
+        self.logs = Logs(folder, self.run.config.training.evaluation_episodes, beginning.logs)
+        self.config_file = file_record(read_bytes(folder / "config.json"))
         self._record_session()
         self.seconds_before, self.started = self.run.counters.seconds, time.monotonic()
 
@@ -138,12 +143,16 @@ class RunWriter:
         began, counters = time.monotonic(), self.run.counters
         counters.seconds = self._seconds()
         checkpoint = to_checkpoint(snapshot, environments)
-        checkpoint.state["logs"] = self.logs.positions()
+        checkpoint.state["logs"] = msgspec.to_builtins(self._files())
         checkpoint.state["facts"] = self.facts
         path = save_checkpoint(
             self.folder / "checkpoints", counters.steps, checkpoint, snapshot.replay, self.run.evaluation_postponed
         )
         return Saved(path, time.monotonic() - began)
+
+    def _files(self) -> dict[str, FileRecord]:
+        """What the logs and config.json are now, so that later damage is seen."""
+        return {"config.json": self.config_file, **self.logs.records()}
 
     def _record_session(self) -> None:
         """One line per session in sessions.jsonl: where it began, on what, and what was noted."""
@@ -161,15 +170,10 @@ class RunWriter:
         counters = self.run.counters
         assert counters.best_return is not None
         assert counters.last_return is not None
-        result = {
-            "reason": reason,
-            "steps": counters.steps,
-            "updates": counters.updates,
-            "episodes": counters.episodes,
-            "best_return": counters.best_return,
-            "final_return": counters.last_return,
-            "seconds": counters.seconds,
-        }
+        result = Result(
+            reason, counters.steps, counters.updates, counters.episodes, counters.best_return, counters.last_return,
+            counters.seconds, self._files(),
+        )  # fmt: skip
         write_json(self.folder / "result.json", result)
         yield self.progress()
         yield Finished(

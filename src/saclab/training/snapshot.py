@@ -11,8 +11,9 @@ from saclab.algorithm.types import LearnerState
 from saclab.config import Config
 from saclab.replay import RowLayout
 from saclab.training.captured import join_arrays, part, plain_numbers, require_like, restore_generator, split_arrays
-from saclab.training.checkpoint import Arrays, Checkpoint, CheckpointError, Replay
+from saclab.training.checkpoint import Arrays, Checkpoint, Replay
 from saclab.training.learners import finite_arrays, initial_learner, learner_from
+from saclab.training.manifest import CheckpointError
 from saclab.training.run_state import Counters, RunState
 
 EnvironmentStates = list[dict[str, Any] | None]

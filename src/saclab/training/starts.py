@@ -10,13 +10,14 @@ from saclab.config import Config
 from saclab.errors import UserError
 from saclab.files import write_json
 from saclab.machine import different_facts
+from saclab.records import FileRecord, RunDescription
 from saclab.replay import RowLayout
-from saclab.training.captured import part, plain_numbers
-from saclab.training.checkpoint import FORMAT as CHECKPOINT_FORMAT
-from saclab.training.checkpoint import Checkpoint, CheckpointError
+from saclab.training.checkpoint import Checkpoint
 from saclab.training.common_checkpoint import read_common
 from saclab.training.engine import Engine, EngineBuilder, EnvironmentStateError
-from saclab.training.run_folder import FORMAT, read_config
+from saclab.training.manifest import FORMAT as CHECKPOINT_FORMAT
+from saclab.training.manifest import CheckpointError
+from saclab.training.run_folder import FORMAT, files_in, read_config
 from saclab.training.snapshot import Start, from_checkpoint, new_start
 
 
@@ -24,8 +25,8 @@ class Beginning(NamedTuple):
     """How a session begins with a run."""
 
     start: Start
-    log_lengths: dict[str, int] | None
-    """Bytes of each log that belong to the checkpoint; None for a new run."""
+    logs: dict[str, FileRecord] | None
+    """What belongs of each log to the checkpoint; None for a new run."""
     notes: list[str]
     """What the user should know; the first says the update-to-data ratio."""
 
@@ -63,7 +64,7 @@ def begin_folder(folder: Path, config: Config, facts: dict[str, Any]) -> bool:
     if (folder / "config.json").exists():
         require_same_config(folder, config)
         return True
-    write_json(folder / "config.json", {"format": FORMAT, "config": config.to_dict(), **facts})
+    write_json(folder / "config.json", RunDescription(FORMAT, config.to_dict(), **facts))
     return False
 
 
@@ -73,8 +74,7 @@ def continued(
     """Go on from a checkpoint of this folder."""
     try:
         start = from_checkpoint(config, layout, checkpoint)
-        lengths = part(checkpoint.state, "logs", dict)
-        log_lengths = plain_numbers(lengths, dict.fromkeys(lengths, 0))
+        logs = files_in(checkpoint.state)
     except CheckpointError as error:
         raise cannot_continue(folder, error) from error
     if start.restarting:
@@ -88,7 +88,7 @@ def continued(
             "the last bits from what they would have been"
         )
     notes += different_facts(checkpoint.state.get("facts"), facts)
-    return Beginning(start, log_lengths, notes)
+    return Beginning(start, logs, notes)
 
 
 def build(builder: EngineBuilder, beginnings: Sequence[Beginning], folders: Sequence[Path]) -> Engine:

@@ -202,8 +202,6 @@ def read_begun(statuses: Sequence[RunStatus]) -> tuple[list[RunRecord], dict[Pat
     """The runs of a grid that have begun, and the reasons why some of their folders cannot be read."""
     folders = [status.cell.folder for status in statuses]
     return read_runs([folder for folder in folders if (folder / "config.json").exists()])
-        [cell.folder for cell in (status.cell for status in statuses) if (cell.folder / "config.json").exists()]
-    )
 
 
 def write_page(runs: Sequence[RunRecord], report: Path) -> Path | None:

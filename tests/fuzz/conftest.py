@@ -17,5 +17,5 @@ settings.register_profile("slow", parent=settings.get_profile("fast"), max_examp
 settings.register_profile(
     "long", parent=settings.get_profile("fast"), max_examples=20_000, derandomize=False, print_blob=True
 )
-FAST = settings.get_profile(os.environ.get("SACLAB_FUZZ", "fast"))
+FAST = settings.get_profile("fast")
 SLOW = settings.get_profile(os.environ.get("SACLAB_FUZZ", "slow"))

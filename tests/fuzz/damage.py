@@ -21,15 +21,16 @@ OTHER_TEXTS = (
 )  # fmt: skip
 NUMBER_OR_WORD = b"0123456789.-eE+"
 
-Damage = tuple[str, float, float, int]
-"""Kind, which file and where in it as shares, and which value."""
+SHARE = st.floats(0, 1, exclude_max=True)
+Damage = tuple[str, str | float, float, int]
+"""Kind, which file (its name, or a share of the list), where in it as a share, and which value."""
 damages = st.tuples(
     st.sampled_from((
         "cut", "flip", "put", "value", "delete", "duplicate line", "drop line", "swap lines", "duplicate column",
         "swap files", "directory", "dangling link", "link to itself", "pipe", "parent becomes file", "append",
         "hostile manifest",
     )),
-    st.floats(0, 1, exclude_max=True), st.floats(0, 1, exclude_max=True), st.integers(0, 255),
+    st.just("evaluations.csv") | SHARE, SHARE, st.integers(0, 255),
 )  # fmt: skip
 
 
@@ -39,7 +40,9 @@ def apply(run: Path, damage: Damage) -> None:
     files = sorted(path for path in run.rglob("*") if path.is_file() and not path.is_symlink())
     if not files:
         return
-    path, other = files[int(which * len(files))], files[int(where * len(files))]
+    named = [path for path in files if path.name == which]
+    path = named[0] if named else files[0 if isinstance(which, str) else int(which * len(files))]
+    other = files[int(where * len(files))]
     content = path.read_bytes()
     place = int(where * len(content))
     if kind in ("delete", "directory", "dangling link", "link to itself", "pipe"):
@@ -70,9 +73,10 @@ def apply(run: Path, damage: Damage) -> None:
             shutil.rmtree(path.parent)
             path.parent.write_bytes(content)
         case "hostile manifest":
-            manifests = [path for path in files if path.name == "manifest.json"]
+            manifests = [path for path in files if path.name == "manifest.json"
+                         and path.with_name("manifest.sha256") in files]  # fmt: skip
             if manifests:
-                path = manifests[int(which * len(manifests))]
+                path = manifests[choice % len(manifests)]
                 content = with_value(path.read_bytes(), where, OTHER_VALUES[choice % len(OTHER_VALUES)])
                 path.write_bytes(content)
                 path.with_name("manifest.sha256").write_text(hashlib.sha256(content).hexdigest() + "\n")

@@ -25,6 +25,7 @@ from saclab.algorithm.learner import Learner, make_learner
 from saclab.algorithm.scalars import Scalars, scalars
 from saclab.algorithm.types import Batch, Context, LearnerState
 from saclab.settings import AlgorithmSettings, structure
+from saclab.training.process import compiled
 from saclab.variants import VARIANTS, variant_settings
 
 jax.config.update("jax_disable_most_optimizations", True)
@@ -151,7 +152,7 @@ def compiled_learner(shape: AlgorithmSettings) -> tuple[Learner, Callable[..., L
         traces.append(None)
         return learner.update(*arguments)
 
-    return learner, jax.jit(update), traces
+    return learner, compiled(update), traces
 
 
 def make_case(settings: AlgorithmSettings) -> Case:

@@ -12,6 +12,9 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES = ("saclab", "jax", "jaxlib", "numpy", "optax", "gymnasium", "mujoco")
+COMPILER_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
+"""What XLA is told for each program on a CPU: no fusions by YNNPACK, which jaxlib 0.10.2 and later can compile into
+wrong products or crashes (github.com/jax-ml/jax, issues 39103, 39257)."""
 HOW_TO_MATCH = {
     "threads": "continue exactly with --threads {0} (or NPROC={0} in the environment)",
     "numpy_threads": "continue exactly with OPENBLAS_NUM_THREADS={0} in the environment (--threads sets it too)",
@@ -35,6 +38,7 @@ def machine_facts(device: str = "", batch: int = 0) -> dict[str, Any]:
             "threads": visible_threads("NPROC"),
             "numpy_threads": visible_threads("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"),
             "xla_flags": os.environ.get("XLA_FLAGS", ""),
+            "compiler_options": " ".join(f"{name}={value}" for name, value in COMPILER_OPTIONS.items()),
             "device": device,
             "batch": batch,
         },

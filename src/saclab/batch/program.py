@@ -25,6 +25,7 @@ from saclab.algorithm.scalars import unpack
 from saclab.algorithm.types import Context, LearnerState, Trained
 from saclab.replay import RowLayout
 from saclab.settings import AlgorithmSettings
+from saclab.training.process import compiled
 
 RUNS: Any = PartitionSpec("runs")  # type: ignore[no-untyped-call]
 SHARED: Any = PartitionSpec()  # type: ignore[no-untyped-call]
@@ -170,4 +171,4 @@ class Program:
         axes = jax.tree.map(lambda spec: None if spec is SHARED else 0, specs)
         over_slots = jax.vmap(function, in_axes=axes)
         over_devices = jax.shard_map(over_slots, mesh=self.mesh, in_specs=specs, out_specs=RUNS, check_vma=False)
-        return jax.jit(over_devices, donate_argnums=donated)
+        return compiled(over_devices, donated)

@@ -22,6 +22,7 @@ from saclab.replay import RowLayout
 from saclab.settings import AlgorithmSettings, structure
 from saclab.training import seeds
 from saclab.training.captured import require_like
+from saclab.training.process import compiled
 
 
 def learner_of(settings: AlgorithmSettings, layout: RowLayout) -> Learner:
@@ -49,7 +50,7 @@ def initial_learner(config: Config, layout: RowLayout) -> LearnerState:
 def compiled_init(shape: AlgorithmSettings, layout: RowLayout) -> Callable[[np.ndarray, np.ndarray], LearnerState]:
     """(plain numbers i32[N], key u32[2]) -> the state before the first update; compiled once for a `structure`."""
     learner = learner_of(shape, layout)
-    return jax.jit(lambda numbers, key: learner.init(unpack(numbers), key))
+    return compiled(lambda numbers, key: learner.init(unpack(numbers), key))
 
 
 @lru_cache(maxsize=16)
@@ -68,7 +69,7 @@ def compiled_update(
         state = learner.update(unpack(numbers), state, layout.unpack(rows), context)
         return state, state.report
 
-    return jax.jit(update, donate_argnums=1)
+    return compiled(update, donate_argnums=1)
 
 
 def on_device(tree: Any) -> Any:

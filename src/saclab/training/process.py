@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxlib import version as jaxlib_version
 
 from saclab.files import absolute
-from saclab.machine import accelerator_plugins, processor_features, visible_threads
+from saclab.machine import COMPILER_OPTIONS, accelerator_plugins, processor_features, visible_threads
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 KEPT_BYTES = 2**28  # larger blocks, such as most replay buffers, still come from the system and go back to it
@@ -25,6 +26,12 @@ def device_name() -> str:
     """What XLA computes on, such as `cpu` or `2 × NVIDIA H200`."""
     devices = jax.devices()
     return f"{len(devices)} × {devices[0].device_kind}" if len(devices) > 1 else str(devices[0].device_kind)
+
+
+def compiled(function: Callable[..., Any], donate_argnums: int | tuple[int, ...] = ()) -> Callable[..., Any]:
+    """`jax.jit` as saclab's programs need it."""
+    options = COMPILER_OPTIONS if jax.default_backend() == "cpu" else {}
+    return jax.jit(function, donate_argnums=donate_argnums, compiler_options=options)
 
 
 @lru_cache(maxsize=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
@@ -20,7 +21,9 @@ from saclab.cli.main import main
 from saclab.environments import watch
 from saclab.environments.checked import CheckedEnvironment
 from saclab.errors import RunBroken, for_terminal
+from saclab.trained_policy import load_policy, save_policy
 from saclab.training.common_checkpoint import checkpoint_steps
+from saclab.training.run_folder import read_config
 
 from .rogue import HAPPENINGS, Rogue
 
@@ -116,16 +119,14 @@ def trained(tmp_path_factory):
 def test_evaluate_and_record_say_it_too(trained, tmp_path, capfd, where, verb):
     if (verb, where) == ("evaluate", "render"):
         pytest.skip("an evaluation draws nothing")
-    path = trained / "best/policy.json"
-    before = path.read_text()
-    path.write_text(before.replace('"environment_arguments": {}', f'"environment_arguments": {{"where": "{where}"}}'))
+    run, policy = tmp_path / "run", load_policy(trained)
+    config = dataclasses.replace(read_config(trained), environment_arguments={"where": where})
+    save_policy(run / "best", config, policy.spec, policy.parameters, {})
     more = ["--video", str(tmp_path / "film.mp4")] if verb == "record" else []
-    status, told = command(tmp_path, capfd, verb, str(trained), *more)
-    path.write_text(before)
+    status, told = command(tmp_path, capfd, verb, str(run), *more)
     assert status == (2 if where in ("__init__", "render") else 1)
     assert f"in {where}: RuntimeError: the wheels" in told.splitlines()[-1]
-    assert "rogue.py" in (trained / "traceback.txt").read_text()
-    (trained / "traceback.txt").unlink()
+    assert "rogue.py" in (run / "traceback.txt").read_text()
 
 
 def test_the_python_interface_raises_with_the_traceback(tmp_path):

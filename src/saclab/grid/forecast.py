@@ -18,6 +18,7 @@ from saclab.errors import TrainingFailed
 from saclab.exits import end_after
 from saclab.grid.plan import Cell
 from saclab.grid.tasks import make_statuses, make_tasks
+from saclab.limits import LARGEST_COUNT
 from saclab.machine import thread_limits
 from saclab.signals import die_with, how_it_ended
 
@@ -150,7 +151,7 @@ def builder_of(kind: Kind) -> EngineBuilder:
 def endless(config: Config) -> Config:
     """The same run with the shortest random phase and no end."""
     training = dataclasses.replace(
-        config.training, random_steps=config.algorithm.batch_size, max_updates=None, max_steps=sys.maxsize
+        config.training, random_steps=config.algorithm.batch_size, max_updates=None, max_steps=LARGEST_COUNT
     )
     return dataclasses.replace(config, training=training)
 

@@ -11,11 +11,13 @@ from hypothesis import HealthCheck, settings
 
 CHECKS = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture, HealthCheck.data_too_large)
 settings.register_profile(
-    "fast", max_examples=100, derandomize=True, database=None, deadline=5000, suppress_health_check=CHECKS
+    "fast", max_examples=50, derandomize=True, database=None, deadline=5000, suppress_health_check=CHECKS
 )
 settings.register_profile("slow", parent=settings.get_profile("fast"), max_examples=2000)
 settings.register_profile(
     "long", parent=settings.get_profile("fast"), max_examples=20_000, derandomize=False, print_blob=True
 )
+ASKED = os.environ.get("SACLAB_FUZZ", "")
+settings.load_profile(ASKED or "fast")
 FAST = settings.get_profile("fast")
-SLOW = settings.get_profile(os.environ.get("SACLAB_FUZZ", "slow"))
+SLOW = settings.get_profile(ASKED or "slow")

@@ -195,7 +195,7 @@ LARGEST_TRAINED = {
     "max_steps": 320, "random_steps": 310, "batch_size": 310,
 }  # fmt: skip
 """Setting -> the largest value that is trained with here."""
-FEW = max(5, settings().max_examples // 20)  # of the profile's, each of which takes seconds
+FEW = min(200, max(5, settings().max_examples // 10))  # of the profile's, each of which takes seconds
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from saclab.config import Config
+from saclab.errors import UserError
 from saclab.files import absolute
 from saclab.grid.launch import launch
 from saclab.grid.plan import Cell, make_grid
@@ -193,8 +194,12 @@ def reporting(
     for statuses in stream:
         left = [status for status in statuses if status.status in ("running", "waiting")]
         before, hangs = hangs, bool(left) and all(status.stalled for status in left)
-        if hangs and not before and (page := write_page(read_begun(statuses)[0], report)):
-            tell(f"nothing goes on but {len(left)} run(s) that hang; until they do or are stopped: report: {page}")
+        if hangs and not before:
+            told = f"nothing goes on but {len(left)} run(s) that hang; until they do or are stopped: report: "
+            try:
+                tell(f"{told}{write_page(read_begun(statuses)[0], report)}")
+            except UserError as error:  # what goes on is worth more
+                tell(f"{told}none ({error})")
         yield statuses
 
 

@@ -30,6 +30,7 @@ def machine_facts(device: str = "", batch: int = 0) -> dict[str, Any]:
         device: what XLA computes on; empty where nothing is computed.
         batch: slots of the run group that a run is trained in; 0 if it is alone.
     """
+    options = COMPILER_OPTIONS if device == "cpu" else {}
     return {
         "versions": {package: version(package) for package in PACKAGES} | {"python": platform.python_version()},
         "machine": {
@@ -38,7 +39,7 @@ def machine_facts(device: str = "", batch: int = 0) -> dict[str, Any]:
             "threads": visible_threads("NPROC"),
             "numpy_threads": visible_threads("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"),
             "xla_flags": os.environ.get("XLA_FLAGS", ""),
-            "compiler_options": " ".join(f"{name}={value}" for name, value in COMPILER_OPTIONS.items()),
+            "compiler_options": " ".join(f"{name}={value}" for name, value in options.items()),
             "device": device,
             "batch": batch,
         },
@@ -75,7 +76,10 @@ def available_memory() -> int | None:
         limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
     if limit.exists() and used.exists() and limit.read_text().strip() != "max":
-        limits.append(int(limit.read_text()) - int(used.read_text()))
+        counted = Path("/sys/fs/cgroup/memory.stat")
+        entries = dict(line.split() for line in counted.read_text().splitlines()) if counted.exists() else {}
+        cached = int(entries.get("inactive_file", 0))  # of files, given up when memory is asked for
+        limits.append(int(limit.read_text()) - int(used.read_text()) + cached)
     return min(limits, default=None)
 
 

@@ -99,12 +99,13 @@ def require_memory(
     share = getattr(needed, largest)
     rest = available / runs_at_once - (sum(needed) - share)
     fits = max(0, int(0.8 * rest / share * capacity))
+    way_out = WAYS_OUT[largest].format(fits=fits) if fits or largest != "replay" else WAYS_OUT["networks"]
     together = f" in each of {runs_at_once} runs at once" if runs_at_once > 1 else ""
     parts = f"; with the rest {in_gib(total)}" if sum(needed) - share > GIB / 100 else ""
     raise SettingError(
         setting, value,
         f"{what}{together} take {in_gib(runs_at_once * share)}{parts}, and {in_gib(available)} are free: "
-        f"{WAYS_OUT[largest].format(fits=fits)}" + (f" or a smaller {fewer}" if runs_at_once > 1 else ""),
+        f"{way_out}" + (f" or a smaller {fewer}" if runs_at_once > 1 else ""),
     )  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from saclab.errors import UserError
 from saclab.machine import available_memory
 
 JSON_BYTES = 2**26
+SMALL_BYTES = 2**26  # read however little memory seems to be free: that is not known to the byte
 """Far more than a description, a result or a manifest takes."""
 UNREADABLE = (msgspec.MsgspecError, RecursionError, ValueError)
 """What msgspec raises for content that does not fit."""
@@ -191,7 +192,7 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
                 raise Unreadable(path, "it is no plain file", LET_READ)
             if limit is not None and status.st_size > limit:
                 raise Damaged(path, f"it has {status.st_size} bytes, more than the {limit} that it can have")
-            if available is not None and status.st_size > available:
+            if available is not None and status.st_size > max(available, SMALL_BYTES):
                 raise Damaged(path, f"it has {status.st_size} bytes, and {available} bytes of memory are free")
             return file.read()
     except FileNotFoundError as error:

@@ -6,7 +6,6 @@ This file imports no numerical library, so that `saclab --help` stays fast.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -155,12 +154,6 @@ def require_ranges(settings: AlgorithmSettings) -> None:
     for name, known in choices().items():
         value = getattr(settings, name)
         require(value in known, name, value, f"use one of {', '.join(map(str, known))}")
-
-    for name in field_names(type(settings)):
-        value = getattr(settings, name)
-        numbers = value if isinstance(value, tuple) else (value,)
-        finite = all(math.isfinite(number) for number in numbers if isinstance(number, float))
-        require(finite, name, value, "use finite numbers")
 
     def check(name: str, condition: Callable[[Any], bool], way_out: str) -> None:
         require(condition(getattr(settings, name)), name, getattr(settings, name), way_out)

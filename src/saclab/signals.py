@@ -21,8 +21,8 @@ SECONDS_TO_OBEY = 8.0
 """A process that was asked to stop and saves nothing for so long is ended."""
 POLL_SECONDS = 0.1
 LAST_WORDS = (
-    f"saclab: asked to stop, and for {SECONDS_TO_OBEY:g} seconds nothing could be saved (a compilation, or a step that "
-    "takes long): ended. Nothing that was saved is lost, and the same command goes on from there\n"
+    f"saclab: asked to stop, and {SECONDS_TO_OBEY:g} seconds later neither saving nor at the end (a compilation, or a "
+    "step that takes long): ended. Nothing that was saved is lost, and the same command goes on from there\n"
 )
 SHOW_CURSOR = b"\x1b[?25h"  # a live display has hidden it
 PR_SET_PDEATHSIG = 1  # of Linux's prctl.h

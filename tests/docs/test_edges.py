@@ -16,7 +16,10 @@ def test_every_promise_names_a_test_that_exists():
         named = re.findall(r"(tests/\S+\.py)::(\w+)", row)
         assert named, row
         for path, name in named:
-            assert f"def {name}(" in (ROOT / path).read_text(), f"{path}::{name}"
+            before, found, _ = (ROOT / path).read_text().partition(f"def {name}(")
+            assert found, f"{path}::{name}"
+            slow = "@pytest.mark.slow\n" in before.rpartition("\n\n\n")[2]
+            assert slow <= ("slow" in row.rpartition("::")[2]), f"{name} is slow"
 
 
 def test_every_fuzzer_is_in_the_table():

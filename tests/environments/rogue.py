@@ -114,7 +114,8 @@ class Meddling(Constant):
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         self.meddle()
         if self.folder:
-            print("x" * 100_000)
+            print("x" * 100_000, flush=True)
+            os.write(1, b"\xff\xfe no text\n")
             self.close()
         return super().reset(seed=seed)
 

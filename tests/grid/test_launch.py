@@ -16,7 +16,7 @@ from saclab.grid.launch import launch
 from saclab.grid.local import core_groups, local_pool
 from saclab.grid.plan import Cell, make_grid, require_startable, seed_numbers
 from saclab.grid.rate import RateMeter
-from saclab.grid.tasks import RunStatus
+from saclab.grid.tasks import RunStatus, Task
 from saclab.machine import usable_cores
 from saclab.training.common_checkpoint import checkpoint_steps
 from saclab.training.lock import InUse, holder, locked
@@ -186,6 +186,14 @@ def rogues(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     )
     for folder in (tests, tmp_path):
         monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
+
+
+def test_a_group_hangs_as_a_whole_and_comes_back_as_a_whole(tmp_path: Path) -> None:
+    task = Task([RunStatus(cell) for cell in grid(tmp_path)], slots=2)
+    task.enter({"run": 0, "event": "stalled", "message": "step has taken 60 s"})
+    assert [run.stalled for run in task.runs] == [True, True]
+    task.enter({"run": 1, "event": "progress", "fraction": 0.5, "updates": 1, "episodes": 0})
+    assert [run.stalled for run in task.runs] == [False, False]
 
 
 @pytest.mark.slow

@@ -142,3 +142,12 @@ def test_evaluations_of_before_checksums_are_computed_again(tmp_path, reason):
     (run / "evaluations.csv").write_text("".join(",".join(row) + "\n" for row in DAMAGE[reason](rows)))
     with pytest.raises(UserError, match=rf"evaluations\.csv is damaged \(.*{reason}"):
         read_run(run)
+
+
+def test_a_place_that_is_not_there_is_not_passed_over(tmp_path: Path) -> None:
+    """Beside others: alone it is an error."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.json").write_text("{}")
+    assert find_runs([tmp_path / "run", tmp_path / "nowhere"]) == [tmp_path / "nowhere", tmp_path / "run"]
+    with pytest.raises(UserError, match="nowhere"):
+        find_runs([tmp_path / "nowhere"])

@@ -188,7 +188,7 @@ class PoolWorker:
             runs: i64[n], ascending: the run of each of its environments.
         """
         self.runs = runs
-        self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - open as long as the process
+        self.errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115 - open as long as the process
         told, self.warnings = os.pipe()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "saclab.batch.worker"],

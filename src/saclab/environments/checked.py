@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from saclab.environments.foreign import Calls, signals_kept
+from saclab.environments.foreign import Calls, meant_for_saclab, signals_kept
 from saclab.environments.make import make_with_spec
 from saclab.environments.simulator import State, capture_state, restore_state
 from saclab.errors import RunBroken, in_words
@@ -87,7 +87,9 @@ class CheckedEnvironment:
             self.calls.run("saclab_restore", restore_state, self.environment, state)
         except (KeyError, OverflowError, TypeError, ValueError):
             raise
-        except Exception as error:
+        except BaseException as error:
+            if meant_for_saclab(error):
+                raise
             raise self.calls.raised("saclab_restore", error) from error
 
     def render(self) -> Any:

@@ -68,13 +68,8 @@ class Calls:
 
 
 def meant_for_saclab(error: BaseException) -> bool:
-    """Whether an error that came up in an environment's code is none of its own: Ctrl-C, or saclab's own way to stop.
-
-    Where saclab handles Ctrl-C, a KeyboardInterrupt is the environment's own.
-    """
-    if isinstance(error, KeyboardInterrupt):
-        return signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    return not isinstance(error, Exception) and type(error).__module__.startswith("saclab.")
+    """Whether an error that came up in an environment's code is Ctrl-C; where saclab handles that, it is its own."""
+    return isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @contextmanager

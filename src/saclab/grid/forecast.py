@@ -23,7 +23,7 @@ from saclab.machine import thread_limits
 from saclab.signals import die_with, how_it_ended
 
 if TYPE_CHECKING:
-    from saclab.training.engine import EngineBuilder
+    from saclab.training.engine import Engine, EngineBuilder
 
 WARM_UPDATES, MEASURED_UPDATES = 5, 40
 
@@ -108,6 +108,7 @@ def measure_in_process(kinds: Sequence[Kind], threads: int) -> list[Cost]:
         input=json.dumps({"parent": os.getpid(), "kinds": described}),
         capture_output=True,
         text=True,
+        errors="replace",  # an environment may print anything
         env=os.environ | thread_limits(threads),
         start_new_session=True,  # Ctrl-C is for this process, and that one dies with it
     )
@@ -127,16 +128,22 @@ def measure(kind: Kind) -> Cost:
         counters, random_steps = run.counters, run.config.training.random_steps
         began = time.perf_counter()
         while counters.steps < random_steps:
-            engine.step()
+            step(engine)
         per_step = (time.perf_counter() - began) / counters.steps
         while counters.updates < WARM_UPDATES:
-            engine.step()
+            step(engine)
         engine.actor(0)  # waits for the updates
         began, first = time.perf_counter(), counters.updates
         while counters.updates < first + MEASURED_UPDATES:
-            engine.step()
+            step(engine)
         engine.actor(0)
         return Cost((time.perf_counter() - began) / (counters.updates - first), per_step)
+
+
+def step(engine: Engine) -> None:
+    """One step; raises RunBroken if it ends a run, which would never come to its updates."""
+    for broken in engine.step().broken.values():
+        raise broken.error
 
 
 def builder_of(kind: Kind) -> EngineBuilder:

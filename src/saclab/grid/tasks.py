@@ -48,13 +48,12 @@ class RunStatus:
         """Take in one line of the worker."""
         match message:
             case {"event": "progress", "fraction": float(fraction), "updates": int(updates), "episodes": int(episodes)}:
-                self.fraction, self.updates, self.episodes, self.stalled = fraction, updates, episodes, False
+                self.fraction, self.updates, self.episodes = fraction, updates, episodes
                 self.meter.enter(time.monotonic(), fraction, updates)
             case {"event": "evaluated", "mean_return": float(mean)}:
                 self.evaluation_return = mean
-            case {"event": "warned" | "stalled" as event, "message": str(text)}:
+            case {"event": "warned" | "stalled", "message": str(text)}:
                 self.warnings.append(text)
-                self.stalled = event == "stalled"
             case {"event": "finished"}:
                 self.status, self.fraction = "finished", 1.0
             case {"event": "interrupted"}:
@@ -67,7 +66,7 @@ class RunStatus:
     def lose_worker(self, why: str) -> None:
         """Wait for another worker, which goes on from the last checkpoint."""
         self.warnings.append(f"its worker was lost ({why}): continued from the last checkpoint")
-        self.status, self.meter = "waiting", RateMeter()
+        self.status, self.meter, self.stalled = "waiting", RateMeter(), False
 
 
 @dataclass(eq=False)
@@ -84,7 +83,7 @@ class Task:
 
     @property
     def started(self) -> bool:
-        return self.runs[0].status != "waiting"
+        return all(run.status != "waiting" for run in self.runs)
 
     def found_elsewhere(self) -> bool:
         """Look at the folders: note what has finished; whether another process trains one of its runs."""
@@ -96,7 +95,8 @@ class Task:
 
     def start(self) -> None:
         for run in self.runs:
-            run.status = "running"
+            if run.status != "finished":  # by another process
+                run.status = "running"
 
     def to_dict(
         self, checkpoint_minutes: float, cores: Sequence[int] = (), workers: int = 1, patience: float = 0
@@ -122,6 +122,9 @@ class Task:
     def enter(self, message: dict[str, Any]) -> None:
         """Take in one line of the worker, which says of which run it speaks."""
         self.runs[message["run"]].enter(message)
+        if message["event"] in ("progress", "warned", "stalled"):  # the runs of a group are stepped together
+            for run in self.runs:
+                run.stalled = message["event"] == "stalled"
 
     def ended(self, code: int, stopping: bool, errors: str) -> None:
         """Note how the process ended; a worker that said nothing of a run's end has failed it.

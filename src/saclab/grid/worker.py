@@ -36,6 +36,7 @@ def main() -> int:
     for run in task["runs"]:
         wait_until_free(Path(run["folder"]), task["patience"])
     from saclab.signals import requests_from_signals
+    from saclab.training.run_folder import is_finished
 
     with requests_from_signals(process_ends=True) as requests, prints_apart() as answers:
 
@@ -47,7 +48,7 @@ def main() -> int:
 
         log.addHandler(logging.StreamHandler())
         log.addHandler(Teller(tell))
-        going_on = set(range(len(task["runs"])))
+        going_on = {place for place, run in enumerate(task["runs"]) if not is_finished(Path(run["folder"]))}
         try:
             for run, event in events(task, requests):
                 for message in messages(event):

@@ -35,7 +35,7 @@ class WorkerProcess:
         """
         log = Path(task["runs"][0]["folder"]) / "worker.log"
         log.parent.mkdir(parents=True, exist_ok=True)
-        self.log = log.open("w+")
+        self.log = log.open("w+", errors="replace")
         self.process = subprocess.Popen(
             [sys.executable, "-m", "saclab.grid.worker"],
             stdin=subprocess.PIPE,

@@ -29,7 +29,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("a+") as file:
-        if not taken(file, fcntl.LOCK_EX):
+        if not taken(file, fcntl.LOCK_EX, LOOKS):
             file.seek(0)
             raise InUse(f"{folder} is in use by process {file.read(20).strip() or '?'}: wait for it, or stop it first")
         file.truncate(0)
@@ -38,14 +38,14 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def taken(file: IO[str], kind: int) -> bool:
-    """Take a lock, unless another process keeps it."""
-    for look in range(LOOKS):
+def taken(file: IO[str], kind: int, looks: int = 1) -> bool:
+    """Take a lock, unless another process keeps it for all of the looks."""
+    for look in range(looks):
         try:
             fcntl.flock(file, kind | fcntl.LOCK_NB)
             return True
         except BlockingIOError:
-            time.sleep(LOOK_SECONDS * (look + 1 < LOOKS))
+            time.sleep(LOOK_SECONDS * (look + 1 < looks))
     return False
 
 
@@ -60,9 +60,16 @@ def holder(folder: Path) -> str | None:
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Wait until no other process is in here with this folder; a file system that knows no locks lets all in."""
-    folder.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(folder, os.O_RDONLY)
+    """Wait until no other process is in here with this folder; a file system that knows no locks lets all in.
+
+    Raises:
+        UserError: if the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror or error}; name another folder") from error
     try:
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -289,8 +289,8 @@ def find_runs(roots: Iterable[Path]) -> list[Path]:
             if "config.json" in (*folders, *files):
                 runs.add(Path(folder))
             folders[:] = [name for name in folders if name != "checkpoints"]
-    runs |= {Path(problem.filename) for problem in problems} - set(roots)
-    if not runs:
+    unreadable = {Path(problem.filename) for problem in problems}
+    if not runs | unreadable - set(roots):
         reasons = "".join(f"; {problem.filename}: {problem.strerror}" for problem in problems)
         raise UserError(f"no run folder (one with a config.json) in {', '.join(map(str, roots))}{reasons}")
-    return sorted(runs)
+    return sorted(runs | unreadable)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import signal
 
 os.environ.setdefault("NPROC", "1")  # before JAX is imported
 os.environ.setdefault("JAX_PLATFORMS", "cpu")  # tolerances are those of 32-bit arithmetic, not of TF32
@@ -30,6 +31,7 @@ from saclab.variants import VARIANTS, variant_settings
 
 jax.config.update("jax_disable_most_optimizations", True)
 jax.config.update("jax_enable_compilation_cache", False)  # what is compiled so is for no one else
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under `nohup` too, what the tests start hears it
 
 OBSERVATION_SIZE, ACTION_SIZE = 3, 2
 

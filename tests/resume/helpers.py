@@ -174,7 +174,9 @@ def wait_for(condition: Callable[[], bool], seconds: float = 120, every: float =
 
 
 def lines_of(path: Path) -> list[dict]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    """The whole lines: another process may be writing the next one."""
+    text = path.read_text().rpartition("\n")[0] if path.exists() else ""
+    return [json.loads(line) for line in text.splitlines()]
 
 
 def settings(**overrides: object) -> Iterator[str]:

@@ -62,7 +62,7 @@ def train(
         UserError: for a name or value that cannot work, or a folder that holds a run with other settings.
     """
     config = make_config(environment, variant, protocol, seed, environment_arguments, overrides)
-    return _train(config, run_path(absolute(runs), config, name), on_event, checkpoint_minutes)
+    return _train(config, run_path(Path(runs), config, name), on_event, checkpoint_minutes)
 
 
 def resume(
@@ -84,10 +84,9 @@ def resume(
     """
     from saclab.environments.make import require_import_allowed
 
-    run = absolute(run)
-    config = read_config(run)
+    config = read_config(Path(run))
     require_import_allowed(config.environment, imports)
-    return _train(config, run, on_event, checkpoint_minutes)
+    return _train(config, Path(run), on_event, checkpoint_minutes)
 
 
 def _train(config: Config, folder: Path, on_event: Callable[[Event], None], checkpoint_minutes: float) -> RunRecord:

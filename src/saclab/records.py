@@ -23,8 +23,7 @@ from saclab.errors import UserError
 from saclab.machine import available_memory
 
 JSON_BYTES = 2**26
-SMALL_BYTES = 2**26  # read however little memory seems to be free: that is not known to the byte
-"""Far more than a description, a result or a manifest takes."""
+"""Far more than a description, a result or a manifest takes; what is no larger is read without a look at memory."""
 UNREADABLE = (msgspec.MsgspecError, RecursionError, ValueError)
 """What msgspec raises for content that does not fit."""
 LET_READ = "put a plain file in its place that this process may read"
@@ -187,12 +186,13 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
     """
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-            status, available = os.fstat(file.fileno()), available_memory()
+            status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise Unreadable(path, "it is no plain file", LET_READ)
             if limit is not None and status.st_size > limit:
                 raise Damaged(path, f"it has {status.st_size} bytes, more than the {limit} that it can have")
-            if available is not None and status.st_size > max(available, SMALL_BYTES):
+            available = available_memory() if status.st_size > JSON_BYTES else None
+            if available is not None and status.st_size > available:
                 raise Damaged(path, f"it has {status.st_size} bytes, and {available} bytes of memory are free")
             return file.read()
     except FileNotFoundError as error:

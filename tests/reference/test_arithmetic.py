@@ -61,6 +61,15 @@ def test_products_and_their_gradients_are_right_in_every_row(rows, hidden):
         np.testing.assert_allclose(found, gradient, rtol=0, atol=2e-5 * np.abs(gradient).max())
 
 
+def test_equal_updates_give_equal_bits(case_of):
+    """However XLA's threads share the work."""
+    case = case_of("averaged-auto/mlp", batch_size=256, hidden_layers=(256, 256))
+    state, batch = case.initial_state(), case.batch(np.random.default_rng(0))
+    updated = [jax.tree.map(np.asarray, case.update(state, batch, step=0)) for _ in range(40)]
+    for other in updated[1:]:
+        jax.tree.map(np.testing.assert_array_equal, other, updated[0])
+
+
 @pytest.mark.parametrize("rows", [256, 16_385, 32_769])
 def test_the_product_that_broke_in_jaxlib_0_10_2_is_right(rows):
     """The case of github.com/jax-ml/jax/issues/39103: without `COMPILER_OPTIONS` the last of 32,769 rows is wrong."""

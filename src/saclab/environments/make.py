@@ -123,7 +123,7 @@ def not_made(environment: str, arguments: Mapping[str, Any], error: BaseExceptio
         way_out = f"{environment} does not accept them ({in_words(error)})"
         refused = SettingError("environment_arguments", dict(arguments), way_out)
     else:
-        advice = "" if not ahead_of_dm_control(error) else "; this dm_control needs MuJoCo 3: pip install 'mujoco<4'"
+        advice = "; this dm_control needs MuJoCo 3: pip install 'mujoco<4'" if ahead_of_dm_control(error) else ""
         refused = UserError(f"environment = {environment!r}: it raised an error in __init__: {in_words(error)}{advice}")
     first = error
     while first.__cause__ is not None:

@@ -26,8 +26,8 @@ def launch(
     """Train every unfinished cell; yields all statuses several times a second.
 
     A failed run does not stop the others. A run that another process trains is waited for; if that process ends before
-    the run does, it goes on here. When `requests.stop` is set, every worker saves its runs and stops; at the
-    end no worker is left behind, however this generator ends.
+    the run does, it goes on here. When `requests.stop` is set, every worker saves its runs and stops; at the end no
+    worker is left behind, however this generator ends.
 
     Args:
         cells: the runs of the grid.

@@ -60,7 +60,9 @@ def all_notices(comparison: Comparison) -> tuple[str, ...]:
         for environment in comparison.environments
         for notice in notices(comparison.runs_of(environment))
     ]
-    return (*told, *[f"{count_text(unreadable, 'folder')} left out that cannot be read"][:unreadable])
+    if unreadable:
+        told.append(f"{count_text(unreadable, 'folder')} left out that cannot be read")
+    return tuple(told)
 
 
 def evaluations(run: RunRecord) -> int:

@@ -7,13 +7,12 @@ import re
 from pathlib import Path
 
 from saclab.errors import TrainingFailed
-from saclab.records import Damaged, Formatted, Manifest, from_json, read_bytes
+from saclab.records import JSON_BYTES, Damaged, Formatted, Manifest, from_json, read_bytes
 
 FORMAT, OLDEST_FORMAT = 2, 1
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
 SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
 CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(-untested)?")
-MANIFEST_BYTES = 2**26  # far more than the plain state of a thousand environments
 
 
 class CheckpointError(TrainingFailed):
@@ -33,7 +32,7 @@ def newest_first(folder: Path) -> list[Path]:
 
 def read_manifest(folder: Path) -> Manifest:
     """The manifest, checked against its own checksum and its schema; raises CheckpointError."""
-    content = read_plain_file(folder / MANIFEST, MANIFEST_BYTES)
+    content = read_plain_file(folder / MANIFEST, JSON_BYTES)
     expected = read_plain_file(folder / MANIFEST_CHECKSUM, 2 * len(hashlib.sha256().hexdigest()))
     if hashlib.sha256(content).hexdigest() != expected.decode(errors="replace").strip():
         raise CheckpointError(f"{MANIFEST} does not match its checksum")

@@ -77,7 +77,7 @@ def safe_name(text: str) -> str:
 
 def read_config(run: Path) -> Config:
     """The configuration of a run folder; raises UserError if it is not one, or is not the one that was recorded."""
-    return config_of(run, read_description(run, recorded_files(run)))
+    return config_of(run, read_description(run, recorded_files(run, read_result(run))))
 
 
 def read_description(run: Path, recorded: Mapping[str, FileRecord]) -> RunDescription:
@@ -149,12 +149,11 @@ def read_result(run: Path) -> Result | None:
         return None
 
 
-def recorded_files(run: Path) -> dict[str, FileRecord]:
+def recorded_files(run: Path, result: Result | None) -> dict[str, FileRecord]:
     """What is known of config.json and the logs: from the end of a run, or from its newest checkpoint.
 
     Empty where nothing is: before the first checkpoint, and for runs of before November 2026.
     """
-    result = read_result(run)
     if result is not None and result.files:
         return result.files
     for path in newest_first(run / "checkpoints"):
@@ -198,7 +197,8 @@ def read_run(run: Path) -> RunRecord:
         UserError: if it is not one, or a file in it is damaged: what was recorded of the logs, and what follows from
             other numbers, is compared.
     """
-    result, recorded = read_result(run), recorded_files(run)
+    result = read_result(run)
+    recorded = recorded_files(run, result)
     description = read_description(run, recorded)
     config = config_of(run, description)
 

@@ -11,7 +11,7 @@ from saclab.algorithm.losses import FACTORS
 from saclab.algorithm.networks import NETWORKS
 from saclab.algorithm.networks.network import ACTIVATIONS, PROJECTIONS
 from saclab.algorithm.optimizer import SCHEDULES
-from saclab.algorithm.scalars import OF_THE_CONTEXT, pack, scalars, unpack
+from saclab.algorithm.scalars import ELSEWHERE, pack, scalars, unpack
 from saclab.algorithm.targets import REDUCTIONS
 from saclab.errors import SettingError
 from saclab.settings import UPDATES as UPDATE_NAMES
@@ -67,11 +67,12 @@ def test_only_a_setting_that_may_be_left_out_can_be_none():
 def test_every_plain_number_is_an_argument_of_the_update():
     """One that is not would silently have its default in all that is compiled."""
     assert plain_numbers()
-    assert set(plain_numbers()) - set(OF_THE_CONTEXT) == set(scalars(AlgorithmSettings(), 1)) - {"planned_updates"}
+    assert set(plain_numbers()) - set(ELSEWHERE) == set(scalars(AlgorithmSettings(), 1)) - {"planned_updates"}
     changed = AlgorithmSettings(discount=0.5, snapshot_interval=7, adam_beta_1=0.25, target_entropy=-9.0)
     numbers = scalars(changed, 3)
     assert (numbers["discount"], numbers["snapshot_interval"], numbers["adam_beta_1"]) == (0.5, 7, 0.25)
     assert (numbers["target_entropy"], scalars(AlgorithmSettings(), 3)["target_entropy"]) == (-9, -3)
+    assert scalars(AlgorithmSettings(target_entropy_per_action=-0.5), 3)["target_entropy"] == -1.5
     assert numbers["snapshot_interval"].dtype == "int32"
     assert {name: (value, value.dtype) for name, value in unpack(jnp.asarray(pack(numbers))).items()} == {
         name: (value, value.dtype) for name, value in numbers.items()

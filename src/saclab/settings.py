@@ -114,7 +114,10 @@ class AlgorithmSettings:
     """The factor before (−log π − target entropy) in the temperature loss: log α (the paper's authors,
     Stable-Baselines3) or α itself (Eq. 8 to the letter, CleanRL). Adam moves log α in both cases."""
     target_entropy: Annotated[float | None, PLAIN_NUMBER] = None
-    """Entropy that the learned temperature holds the policy to, in nats; None is −dim(A)."""
+    """Entropy that the learned temperature holds the policy to, in nats; None is `target_entropy_per_action` times
+    dim(A)."""
+    target_entropy_per_action: Real = -1.0
+    """Target entropy for each dimension of the action, in nats, if `target_entropy` gives none for all together."""
     log_std_minimum: float = -20.0
     """Lower clip of the policy's log standard deviation."""
     log_std_maximum: float = 2.0

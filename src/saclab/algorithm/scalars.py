@@ -13,10 +13,10 @@ from saclab.settings import AlgorithmSettings, plain_numbers
 Scalars = dict[str, Any]
 """Name of a setting -> f32[] or i32[], NumPy or JAX; [R] where runs are mapped over."""
 
-OF_THE_CONTEXT = ("reward_weights",)
-"""Settings that are arguments of the update in its Context."""
+ELSEWHERE = ("reward_weights", "target_entropy_per_action")
+"""Settings that reach the update in its Context, or as part of another number."""
 
-NAMES = ("planned_updates", *(name for name in plain_numbers() if name not in OF_THE_CONTEXT))
+NAMES = ("planned_updates", *(name for name in plain_numbers() if name not in ELSEWHERE))
 WHOLE = tuple(name for name in NAMES[1:] if type(getattr(AlgorithmSettings, name)) is int)
 
 
@@ -25,13 +25,15 @@ def scalars(settings: AlgorithmSettings, action_size: int, planned_updates: int 
 
     Args:
         settings: of the run.
-        action_size: A; the default target entropy is −A.
+        action_size: A.
         planned_updates: the length of the learning rates' schedule; None if they are constant.
     """
-    learned = settings.temperature == "learned"
+    learned, target_entropy = settings.temperature == "learned", settings.target_entropy
+    if target_entropy is None:
+        target_entropy = settings.target_entropy_per_action * action_size
     given = {
         "temperature_learning_rate": settings.temperature_learning_rate if learned else 0.0,
-        "target_entropy": -action_size if settings.target_entropy is None else settings.target_entropy,
+        "target_entropy": target_entropy,
     }
     numbers = {name: given.get(name, getattr(settings, name)) for name in NAMES[1:]}
     return {"planned_updates": np.float32(planned_updates or 1)} | {

@@ -23,6 +23,8 @@ class Variant:
     """What differs from plain SAC, and from the protocol: names of AlgorithmSettings and TrainingSettings."""
     paper_name: str | None = None
     """The name of the system in the paper's figures and Table 2, if it stands there."""
+    source: str = "the paper"
+    """Where it was published, for the table of variants."""
 
 
 LEARNED = {"temperature": "learned", "initial_temperature": 1.0}

@@ -9,7 +9,7 @@ from pathlib import Path
 from saclab.errors import TrainingFailed
 from saclab.records import JSON_BYTES, Damaged, Formatted, Manifest, from_json, read_bytes
 
-FORMAT, OLDEST_FORMAT = 2, 1
+FORMAT, OLDEST_FORMAT = 3, 1
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
 SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
 CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(-untested)?")

@@ -83,12 +83,14 @@ def product(inputs: tuple[Array, ...], weights: Array) -> Array:
 
 
 def split(vector: Array, sizes: tuple[int, ...]) -> list[Array]:
-    """The parts of a packed vector. The gradient of one split is one concatenation; of as many slices it would be a
-    sum of padded vectors.
+    """The parts of a packed vector.
+
+    It is split as a matrix of one row for the sake of the gradient, which is one concatenation then. That of vectors
+    XLA would fuse with the sums over the batch that are the gradients of biases, each a loop as long as the longest
+    part, masked beyond its own: up to twice the time of a whole update, where that reaches beyond mapped memory.
     """
     *boundaries, _ = accumulate(sizes)
-    parts: list[Array] = vector.__array_namespace__().split(vector, boundaries)
-    return parts
+    return [part[0] for part in vector.__array_namespace__().split(vector[None], boundaries, axis=1)]
 
 
 def project_kernels(

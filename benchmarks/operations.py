@@ -25,11 +25,14 @@ class MatrixProduct(NamedTuple):
     operations: int
     """A product of m×k and k×n matrices counts 2·m·k·n."""
     multiply: Callable[[jax.Array, jax.Array], jax.Array]
+    at_intervals: bool
+    """Whether it is made in every `actor_interval`-th update only."""
 
 
-def update_operations(settings: AlgorithmSettings, layout: RowLayout) -> int:
-    """Floating-point operations of the products of one update."""
-    return sum(product.operations for product in matrix_products(settings, layout))
+def update_operations(settings: AlgorithmSettings, layout: RowLayout) -> float:
+    """Floating-point operations of the products of one update, the mean over many."""
+    share = {False: 1.0, True: 1 / settings.actor_interval}
+    return sum(share[product.at_intervals] * product.operations for product in matrix_products(settings, layout))
 
 
 def matrix_products(settings: AlgorithmSettings, layout: RowLayout) -> list[MatrixProduct]:
@@ -42,15 +45,18 @@ def matrix_products(settings: AlgorithmSettings, layout: RowLayout) -> list[Matr
     return list(products_of(jax.make_jaxpr(learner.update)(numbers, state, batch, context).jaxpr))
 
 
-def products_of(jaxpr: Any) -> Iterator[MatrixProduct]:
+def products_of(jaxpr: Any, at_intervals: bool = False) -> Iterator[MatrixProduct]:
     """The products of a jaxpr, those inside its calls included."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]
             left, right = (operand.aval.shape for operand in equation.invars)
             count = 2 * math.prod(equation.outvars[0].aval.shape) * math.prod(left[axis] for axis in contracted)
-            yield MatrixProduct((left, right), count, partial(equation.primitive.bind, **equation.params))
+            multiply = partial(equation.primitive.bind, **equation.params)
+            yield MatrixProduct((left, right), count, multiply, at_intervals)
+        for branch in equation.params.get("branches", ()):  # those of a part of the update, and nothing at all
+            yield from products_of(branch.jaxpr, at_intervals=True)
         for parameter in equation.params.values():
             inner = getattr(parameter, "jaxpr", None)
             if inner is not None:
-                yield from products_of(inner)
+                yield from products_of(inner, at_intervals)

@@ -11,9 +11,9 @@ import saclab
 
 HOUSE = Path(saclab.__file__).parent
 ROOMS = (
-    "errors", "extras", "files", "limits", "settings", "config", "variants", "protocols", "machine", "records",
-    "algorithm", "environments", "replay", "memory", "trained_policy", "training", "signals", "exits", "batch", "grid",
-    "report", "playback", "api", "cli",
+    "errors", "extras", "files", "limits", "refusals", "settings", "config", "variants", "protocols", "machine",
+    "records", "algorithm", "environments", "replay", "memory", "trained_policy", "training", "signals", "exits",
+    "batch", "grid", "report", "playback", "api", "cli",
 )  # fmt: skip
 """From the ground up: a room imports itself and what stands before it."""
 FILE_LINES, FUNCTION_LINES, NAME_LETTERS = 350, 55, 70

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
-from saclab.errors import UserError, unknown_name
+from saclab.errors import UserError, require, unknown_name
 from saclab.settings import (
     AlgorithmSettings,
     TrainingSettings,

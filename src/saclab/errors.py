@@ -29,6 +29,12 @@ class SettingError(UserError):
         self.setting, self.value, self.way_out = setting, value, way_out
 
 
+def require(condition: bool, setting: str, value: object, way_out: str) -> None:
+    """Raise a SettingError that names the setting, its value and what would work, unless `condition` holds."""
+    if not condition:
+        raise SettingError(setting, value, way_out)
+
+
 class TrainingFailed(RuntimeError):  # noqa: N818 - it names what happened
     """A run cannot go on; what it had saved is kept. The command line exits with status 1."""
 

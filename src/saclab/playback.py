@@ -13,9 +13,8 @@ import numpy as np
 
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.make import EnvironmentSpec, require_import_allowed
-from saclab.errors import RunBroken, UserError
+from saclab.errors import RunBroken, UserError, require
 from saclab.files import absolute
-from saclab.settings import require
 from saclab.trained_policy import TrainedPolicy, load_policy, read_description
 from saclab.training.evaluation import Evaluator
 from saclab.training.failure import tell_of_closing, tracebacks_in

@@ -121,7 +121,7 @@ def make_config(
     Raises:
         UserError: for a name that does not exist or a value that cannot work.
     """
-    said = protocol_settings(protocol, environment) | variant_changes(variant) | dict(overrides or {})
+    said = protocol_settings(protocol, environment) | variant_changes(variant, environment) | dict(overrides or {})
     algorithm, training = split_settings(said)
     return Config(
         environment=environment,

@@ -7,6 +7,8 @@ protocol's.
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +23,8 @@ class Variant:
     description: str
     settings: dict[str, Any] = field(default_factory=dict)
     """What differs from plain SAC, and from the protocol: names of AlgorithmSettings and TrainingSettings."""
+    by_environment: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """What differs further for environments whose id starts with a key."""
     paper_name: str | None = None
     """The name of the system in the paper's figures and Table 2, if it stands there."""
     source: str = "the paper"
@@ -80,15 +84,17 @@ def default_settings(environment: str) -> AlgorithmSettings:
     return AlgorithmSettings(initial_temperature=fixed_temperature(environment))
 
 
-def variant_changes(variant: str) -> dict[str, Any]:
-    """A variant's row; raises UserError for an unknown one."""
+def variant_changes(variant: str, environment: str) -> dict[str, Any]:
+    """A variant's row on an environment; raises UserError for an unknown one."""
     if variant not in VARIANTS:
         raise unknown_name("variant", variant, VARIANTS)
-    return VARIANTS[variant].settings
+    row = VARIANTS[variant]
+    here = [changes for prefix, changes in row.by_environment.items() if task_name(environment).startswith(prefix)]
+    return functools.reduce(operator.or_, here, row.settings)
 
 
 def variant_settings(variant: str, environment: str) -> AlgorithmSettings:
     """The algorithm of a variant on an environment, whatever the protocol; raises UserError for an unknown variant."""
     own = field_names(AlgorithmSettings)
-    changes = {name: value for name, value in variant_changes(variant).items() if name in own}
+    changes = {name: value for name, value in variant_changes(variant, environment).items() if name in own}
     return replace_settings(default_settings(environment), changes)

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-from saclab.errors import UserError, unknown_name
+from saclab.errors import UserError, require, unknown_name
 from saclab.extras import required
 from saclab.machine import usable_cores
-from saclab.settings import require
 
 LAUNCHERS = ("local", "ray")
 ANSWER_SECONDS = 10

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from saclab.config import Config
+from saclab.errors import require
 from saclab.files import absolute, same_directory
 from saclab.protocols import make_config, protocol_row
-from saclab.settings import require
 from saclab.training.run_folder import is_finished, run_path
 
 if TYPE_CHECKING:

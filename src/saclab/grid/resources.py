@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 from saclab.config import Config
+from saclab.errors import require
 from saclab.grid.cluster import Cluster, chosen_cluster
 from saclab.grid.groups import run_groups
 from saclab.grid.local import local_pool
@@ -15,7 +16,6 @@ from saclab.grid.pool import WorkerPool
 from saclab.grid.ray import ray_pool
 from saclab.limits import require_threads
 from saclab.machine import accelerator, usable_cores
-from saclab.settings import require
 
 BATCH_ON_ACCELERATOR = 16
 """Runs that are trained together, unless another number is asked for."""

@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from saclab.config import Config
-from saclab.errors import UserError
+from saclab.errors import UserError, require
 from saclab.records import (
     EPISODES,
     EVALUATIONS,
@@ -47,7 +47,6 @@ from saclab.records import (
     table_from_csv,
     table_from_json_lines,
 )
-from saclab.settings import require
 from saclab.training.logs import evaluation_columns
 from saclab.training.manifest import CheckpointError, newest_first, read_manifest
 

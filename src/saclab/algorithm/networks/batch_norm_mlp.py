@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, project_kernels, split
+from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, orthogonal, project_kernels, split
 
 MOMENTUM = 0.99
 EPSILON = 1e-3
@@ -88,7 +88,7 @@ def initial(shape: Shape, key: jax.Array) -> jax.Array:
     keys = jax.random.split(key, len(shape.kernels))
     gains = [2**0.5] * (len(keys) - 1) + [1.0]
     kernels = [
-        jax.nn.initializers.orthogonal(gain)(layer_key, kernel, jnp.float32).ravel()
+        orthogonal(layer_key, kernel, gain).ravel()
         for gain, layer_key, kernel in zip(gains, keys, shape.kernels, strict=True)
     ]
     affine = [jnp.repeat(jnp.array([1.0, 0.0]), width) for width in shape.normalised]

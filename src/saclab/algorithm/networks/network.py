@@ -122,3 +122,15 @@ PROJECTIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "unit_columns": unit_columns,
 }
 """Name -> what is done to each kernel f32[I, O] after a step."""
+
+
+def orthogonal(key: jax.Array, shape: tuple[int, int], gain: float = 1.0) -> jax.Array:
+    """f32[I, O] with orthonormal rows or columns, times `gain` (Saxe et al. 2014)."""
+    q, r = one_after_another(jnp.linalg.qr)(jax.random.normal(key, (max(shape), min(shape))))
+    q = q * jnp.sign(jnp.diagonal(r))
+    kernel: jax.Array = gain * (q if shape[0] >= shape[1] else q.T)
+    return kernel
+
+
+one_after_another: Callable[..., Any] = jax.custom_batching.sequential_vmap
+"""A function that `jax.vmap` maps over in a loop: jaxlib 0.10's batched QR can wait for itself on two threads."""

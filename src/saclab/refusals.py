@@ -1,0 +1,82 @@
+"""What an algorithm's settings refuse, with the reason: values that cannot work, alone or together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from saclab.errors import require
+
+if TYPE_CHECKING:
+    from saclab.settings import AlgorithmSettings
+
+UPDATES = ("critic", "actor", "temperature", "targets")
+"""The parts of an update."""
+
+
+def require_known(settings: AlgorithmSettings, choices: Mapping[str, tuple[str | None, ...]]) -> None:
+    """Raise SettingError for a name that is not among the choices of its setting."""
+    for name, known in choices.items():
+        value = getattr(settings, name)
+        require(value in known, name, value, f"use one of {', '.join(map(str, known))}")
+
+
+def require_ranges(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for a value that cannot work whatever the others are."""
+
+    def check(name: str, condition: Callable[[Any], bool], way_out: str) -> None:
+        require(condition(getattr(settings, name)), name, getattr(settings, name), way_out)
+
+    check("discount", lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.99")
+    check("polyak_rate", lambda value: 0 < value <= 1, "use a value in (0, 1], such as 0.005")
+    check("snapshots", lambda value: value >= 0, "use a whole number, of 0 for no target network")
+    check("critic_atoms", lambda value: value >= 2, "use a whole number of at least 2, such as 101")
+    check("critic_bound", lambda value: value > 0, "use a value above 0, such as 5")
+    check("final_learning_rate_share", lambda value: 0 <= value <= 1, "use a value in [0, 1], such as 0.5")
+    for name in ("batch_size", "critics", "snapshot_interval", "entropy_window", "actor_interval", "longest_noise"):
+        check(name, lambda value: value >= 1, "use a whole number of at least 1")
+    for name in ("critic_learning_rate", "actor_learning_rate", "temperature_learning_rate"):
+        check(name, lambda value: 0 <= value < 1, "use a value in [0, 1), such as 3e-4")
+    for name in ("adam_beta_1", "adam_beta_2"):
+        check(name, lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.9")
+    for name in ("hidden_layers", "critic_hidden_layers"):
+        check(
+            name,
+            lambda layers: layers is None or (len(layers) > 0 and min(layers) >= 1),
+            "use one or more positive widths, such as 256 256",
+        )
+
+
+def require_possible(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for values that cannot work together."""
+    lowest_allowed = "above 0" if settings.temperature == "learned" else "of at least 0"
+    require(
+        settings.initial_temperature > 0 or (settings.temperature == "fixed" and settings.initial_temperature == 0),
+        "initial_temperature", settings.initial_temperature, f"use a value {lowest_allowed}, such as 0.2",
+    )  # fmt: skip
+    require(
+        settings.log_std_minimum < settings.log_std_maximum,
+        "log_std_minimum", settings.log_std_minimum, f"use a value below log_std_maximum {settings.log_std_maximum}",
+    )  # fmt: skip
+    require(
+        settings.snapshots <= 1 or settings.entropy_window == 1,
+        "entropy_window", settings.entropy_window,
+        f"use 1 together with snapshots {settings.snapshots}: averaging values (Eq. 9) and averaging the entropy "
+        "term are two different algorithms",
+    )  # fmt: skip
+    require(
+        settings.critic_head != "categorical" or settings.entropy_window == 1,
+        "entropy_window", settings.entropy_window,
+        "use 1 together with critic_head categorical: it averages numbers, not distributions",
+    )  # fmt: skip
+    require(
+        len(settings.reward_weights) in (0, len(settings.reward_terms)),
+        "reward_weights", " ".join(map(str, settings.reward_weights)),
+        f"give one for each of the {len(settings.reward_terms)} reward_terms, or none",
+    )  # fmt: skip
+    order = settings.update_order
+    require(
+        sorted(order) == sorted(UPDATES) and order.index("actor") < order.index("temperature"),
+        "update_order", " ".join(order),
+        f"name each of {', '.join(UPDATES)} once, and actor before temperature, which is judged by its entropy",
+    )  # fmt: skip

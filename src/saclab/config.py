@@ -14,12 +14,7 @@ from typing import Any, TypeVar, get_type_hints
 import msgspec
 
 from saclab.errors import UserError, require, unknown_name
-from saclab.settings import (
-    AlgorithmSettings,
-    TrainingSettings,
-    require,
-    structure,
-)
+from saclab.settings import AlgorithmSettings, TrainingSettings, structure
 
 Plain = TypeVar("Plain")
 

@@ -126,11 +126,17 @@ PROJECTIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 
 def orthogonal(key: jax.Array, shape: tuple[int, int], gain: float = 1.0) -> jax.Array:
     """f32[I, O] with orthonormal rows or columns, times `gain` (Saxe et al. 2014)."""
-    q, r = one_after_another(jnp.linalg.qr)(jax.random.normal(key, (max(shape), min(shape))))
+    q, r = factorised(jax.random.normal(key, (max(shape), min(shape))))
     q = q * jnp.sign(jnp.diagonal(r))
     kernel: jax.Array = gain * (q if shape[0] >= shape[1] else q.T)
     return kernel
 
 
-one_after_another: Callable[..., Any] = jax.custom_batching.sequential_vmap
-"""A function that `jax.vmap` maps over in a loop: jaxlib 0.10's batched QR can wait for itself on two threads."""
+one_after_another: Callable[..., Callable[..., Any]] = jax.custom_batching.sequential_vmap
+
+
+@one_after_another
+def factorised(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Q and R; of many networks in a loop, since jaxlib 0.10's batched QR can wait for itself on two threads."""
+    q, r = jnp.linalg.qr(matrix)
+    return q, r

@@ -121,7 +121,10 @@ class EnvironmentWorker:
         config, learner = self.configs[header["run"]], self._learner(header["run"])
         critics = critics_of(config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"])
         try:
-            bias = q_bias_at(config, critics, self.evaluator.environments[0], header["evaluations"])
+            environment, stop = self.evaluator.environments[0], self.buffers.stop
+            bias = q_bias_at(config, critics, environment, header["evaluation"], lambda: bool(stop[0]))
+        except Stopped:
+            return {"stopped": True}, {}
         except Exception as error:
             return {"failure": described(error)}, {}
         return {"bias": list(bias)}, {}

@@ -14,6 +14,7 @@ from saclab.errors import NonFiniteError
 from saclab.training import seeds
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.exploration import Exploration
+from saclab.training.manifest import Moment
 from saclab.training.reward_scale import RewardScale
 
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
@@ -87,6 +88,11 @@ class RunState:
         counters.running_average = kept + (1 - RUNNING_AVERAGE_KEEP) * episode.total_reward
         return counters.episodes
 
+    @property
+    def updates_left(self) -> int:
+        """Updates that the steps so far make due and that have not been made: above 0, a round is under way."""
+        return self.config.training.updates_due(self.counters.steps) - self.counters.updates
+
     # --- evaluations
 
     def evaluation_due(self) -> bool:
@@ -105,9 +111,11 @@ class RunState:
         """An evaluation was broken off: it comes first when the run goes on."""
         self.counters.evaluation_slots = EVALUATE_FIRST
 
-    @property
-    def evaluation_postponed(self) -> bool:
-        return self.counters.evaluation_slots == EVALUATE_FIRST
+    def moment(self) -> Moment:
+        """Where the run stands, as its checkpoints are named."""
+        counters, whole = self.counters, self.updates_left <= 0
+        tested = counters.evaluation_slots != EVALUATE_FIRST
+        return Moment(counters.steps, whole, 0 if whole else counters.updates, tested)
 
     def evaluation_seeds(self) -> list[int]:
         """One for each episode of the next evaluation."""

@@ -18,10 +18,10 @@ def row(monkeypatch):
 
 
 def test_a_variant_keeps_its_own_settings_under_every_protocol(row):
-    row(batch_size=512, critic_learning_rate=1e-4)
+    row(batch_size=48, critic_learning_rate=1e-4)
     for protocol in PROTOCOLS:
         algorithm = make_config("HalfCheetah-v4", "mine", protocol).algorithm
-        assert (algorithm.batch_size, algorithm.critic_learning_rate) == (512, 1e-4)
+        assert (algorithm.batch_size, algorithm.critic_learning_rate) == (48, 1e-4)
     assert make_config("HalfCheetah-v4", "mine", "quick").algorithm.actor_learning_rate == 1e-3
 
 
@@ -33,8 +33,20 @@ def test_a_variant_may_set_how_a_run_is_trained(row):
     assert variant_settings("mine", "Humanoid-v4") == variant_settings("sac", "Humanoid-v4")
 
 
+def test_a_quick_run_of_a_dear_variant_is_held_to_what_takes_minutes(row):
+    dear = {"batch_size": 512, "critic_hidden_layers": (2048, 128), "actor_interval": 2, "updates_per_interval": 20}
+    row(**dear)
+    quick = make_config("HalfCheetah-v4", "mine", "quick")
+    assert (quick.algorithm.batch_size, quick.algorithm.critic_hidden_layers) == (64, (256, 128))
+    assert (quick.algorithm.actor_interval, quick.training.updates_per_interval) == (2, 1)
+    for protocol, overrides in (("standard", {}), ("quick", dear)):
+        config = make_config("HalfCheetah-v4", "mine", protocol, overrides=overrides)
+        assert config.algorithm.critic_hidden_layers == (2048, 128)
+        assert (config.algorithm.batch_size, config.training.updates_per_interval) == (512, 20)
+
+
 def test_what_the_user_says_counts_for_more_than_the_variant(row):
-    row(batch_size=512, random_steps=5000, snapshots=3)
+    row(batch_size=32, random_steps=500, snapshots=3)
     config = make_config("HalfCheetah-v4", "mine", "quick", overrides={"batch_size": 16, "random_steps": 99})
     assert (config.algorithm.batch_size, config.training.random_steps) == (16, 99)
     assert config.algorithm.snapshots == 3

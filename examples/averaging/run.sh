@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
 # Trains every run of docs/averaging.md, two at a time, seed by seed. Stop it at any instant (Ctrl-C, SIGTERM to the
-# process group, a power cut): the same command goes on, finished runs are skipped.
+# process group, a power cut): the same command goes on, finished runs are skipped, and those whose results lie in
+# examples/averaging/runs beside this file already.
 #
 #   examples/averaging/run.sh RUNS [SEEDS_OF_STAGE_1 [SEEDS_OF_STAGE_2]]
 #
 # SACLAB names the program, if it is not on the PATH.
 set -euo pipefail
 runs=${1:?the folder that holds the runs}
+kept=$(dirname "$(realpath "$0")")/runs
 stage_1_seeds=${2:-5}
 stage_2_seeds=${3:-3}
 
@@ -40,6 +42,7 @@ commands() {  # environment, number of seeds, limits of the run; the arms come o
   arms=$(cat)
   for ((seed = 0; seed < seeds; seed++)); do
     while read -r name variant settings; do
+      [[ -e "$kept/$environment/$name/paper/seed-$seed" ]] && continue
       echo "train $environment --variant $variant --name $name $settings --seed $seed --protocol paper" \
         "$* --q-bias-episodes 2 --threads 1 --checkpoint-minutes 5 --runs $runs"
     done <<<"$arms"

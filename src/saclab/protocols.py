@@ -23,6 +23,8 @@ class Protocol:
     """What differs for environments whose id starts with a key."""
     algorithm: dict[str, Any] = field(default_factory=dict)
     """What the protocol changes of the algorithm's settings."""
+    ceilings: dict[str, int] = field(default_factory=dict)
+    """What a variant's own settings are held to, each layer of a network apart; what the user says is not."""
 
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -56,7 +58,8 @@ PROTOCOLS: dict[str, Protocol] = {
     ),
     "quick": Protocol(
         "Minutes instead of hours, to see every part at work: smaller batches and larger steps than the others, and "
-        "too short to judge a variant by.",
+        "too short to judge a variant by. A variant's own batches, layers and updates per step are held to what that "
+        "allows.",
         TrainingSettings(
             random_steps=2_000,
             update_interval=2,
@@ -71,6 +74,14 @@ PROTOCOLS: dict[str, Protocol] = {
             "actor_learning_rate": 1e-3,
             "critic_learning_rate": 1e-3,
             "temperature_learning_rate": 1e-3,
+        },
+        ceilings={
+            "batch_size": 64,
+            "hidden_layers": 256,
+            "critic_hidden_layers": 256,
+            "actor_interval": 3,
+            "updates_per_interval": 1,
+            "random_steps": 2_000,
         },
     ),
 }
@@ -108,7 +119,8 @@ def make_config(
 ) -> Config:
     """The configuration of a run: variant and protocol on an environment, with any setting changed by name.
 
-    What is said later counts: the defaults of the environment, the protocol, the variant, the overrides.
+    What is said later counts: the defaults of the environment, the protocol, the variant (up to the protocol's
+    ceilings), the overrides.
 
     Args:
         environment: Gymnasium id.
@@ -121,7 +133,8 @@ def make_config(
     Raises:
         UserError: for a name that does not exist or a value that cannot work.
     """
-    said = protocol_settings(protocol, environment) | variant_changes(variant, environment) | dict(overrides or {})
+    changes = held_to(protocol_row(protocol).ceilings, variant_changes(variant, environment))
+    said = protocol_settings(protocol, environment) | changes | dict(overrides or {})
     algorithm, training = split_settings(said)
     return Config(
         environment=environment,
@@ -132,6 +145,19 @@ def make_config(
         training=TrainingSettings(**training),
         environment_arguments=dict(environment_arguments or {}),
     )
+
+
+def held_to(ceilings: Mapping[str, int], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """`settings` with none above its ceiling."""
+
+    def held(name: str, value: Any) -> Any:
+        if name not in ceilings or value is None:
+            return value
+        if isinstance(value, tuple):
+            return tuple(min(width, ceilings[name]) for width in value)
+        return min(value, ceilings[name])
+
+    return {name: held(name, value) for name, value in settings.items()}
 
 
 def split_settings(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

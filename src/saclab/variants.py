@@ -29,6 +29,9 @@ class Variant:
     """The name of the system in the paper's figures and Table 2, if it stands there."""
     source: str = "the paper"
     """Where it was published, for the table of variants."""
+    cost: float | None = None
+    """Time of an environment step with its updates on HalfCheetah-v4, on one core, as a multiple of that of `sac` at
+    one update per step (`benchmarks/family.py`)."""
 
 
 LEARNED = {"temperature": "learned", "initial_temperature": 1.0}

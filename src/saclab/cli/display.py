@@ -19,6 +19,7 @@ from saclab.grid.tasks import RunStatus
 from saclab.settings import TrainingSettings
 from saclab.signals import EXIT_STATUS
 from saclab.training import events
+from saclab.variants import Variant
 
 PLAIN_SECONDS = 20  # between two lines of a grid's progress that goes to a file or a pipe
 
@@ -166,6 +167,21 @@ def catalogue(rows: Mapping[str, tuple[str, Mapping[str, Any]]]) -> Table:
         table.add_row(
             f"[bold]{escape(name)}[/]", escape(description) + (f"\n[dim]{escape(listed)}[/]" if listed else "")
         )
+    return table
+
+
+def variants_table(variants: Mapping[str, Variant]) -> Table:
+    """Each variant with its axes, its source and what it costs."""
+    table = Table("variant", "cost", "what it is, its settings, its source", box=None, padding=(0, 2, 1, 0))
+    for name, row in variants.items():
+        told = [escape(row.description)]
+        for where, settings in {"": row.settings, **row.by_environment}.items():
+            if settings:
+                listed = ", ".join(f"{key} {value}" for key, value in settings.items())
+                told.append(f"[dim]{escape(f'{where}*: {listed}' if where else listed)}[/]")
+        told.append(f"[dim]{escape(f'source: {row.source}')}[/]")
+        table.add_row(f"[bold]{escape(name)}[/]", "" if row.cost is None else f"{row.cost:.3g}×", "\n".join(told))
+    table.caption = "cost: time of an environment step with its updates on HalfCheetah-v4, one core; sac is 1×"
     return table
 
 

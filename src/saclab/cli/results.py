@@ -107,7 +107,7 @@ class Variants:
     def __call__(self, console: Console) -> int:
         from saclab.cli import display
 
-        console.print(display.catalogue({name: (row.description, row.settings) for name, row in VARIANTS.items()}))
+        console.print(display.variants_table(VARIANTS))
         return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import hashlib
 import os
 from collections.abc import Callable
@@ -38,6 +39,7 @@ def compiled(function: Callable[..., Any], donate_argnums: int | tuple[int, ...]
 def prepare_process() -> None:
     """Set this process up, once; the results of a run do not depend on it."""
     keep_freed_memory()
+    collect_cycles_rarely()
     use_deterministic_kernels()
     use_compilation_cache()
 
@@ -52,6 +54,15 @@ def keep_freed_memory() -> None:
         mallopt(M_MMAP_THRESHOLD, KEPT_BYTES)
         mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
         mallopt(M_ARENA_MAX, 1)  # the others give a part back as soon as all of it is free
+
+
+def collect_cycles_rarely() -> None:
+    """Let Python look for unreachable cycles once in 50,000 new objects, in place of 700.
+
+    Each look walks through the many thousand objects that JAX keeps, some 3 % of a training's time; a step makes none.
+    """
+    _, *older = gc.get_threshold()
+    gc.set_threshold(50_000, *older)
 
 
 def use_deterministic_kernels() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,31 +15,10 @@ from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.exploration import Exploration
 from saclab.training.manifest import Moment
 from saclab.training.reward_scale import RewardScale
+from saclab.training.saved_state import Counters
 
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
 EVALUATE_FIRST = -1  # for `evaluation_slots`: an evaluation is due before the next step
-
-
-@dataclass
-class Counters:
-    """Where a run stands, in plain values."""
-
-    steps: int = 0
-    """Environment steps, over all environments."""
-    updates: int = 0
-    episodes: int = 0
-    """Training episodes that ended after the random steps."""
-    running_average: float | None = None
-    """Average of the training episodes' returns, recent ones weighing most."""
-    evaluations: int = 0
-    evaluation_slots: int = 0
-    """Multiples of the evaluation interval that were reached."""
-    evaluated_at_update: int = -1
-    best_return: float | None = None
-    best_at_episode: int = 0
-    last_return: float | None = None
-    seconds: float = 0.0
-    """Wall-clock time."""
 
 
 class RunState:

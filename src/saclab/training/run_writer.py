@@ -10,8 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
 from saclab.files import write_json
@@ -143,9 +141,7 @@ class RunWriter:
         """
         began, counters = time.monotonic(), self.run.counters
         counters.seconds = self._seconds()
-        checkpoint = to_checkpoint(snapshot, environments)
-        checkpoint.state["logs"] = msgspec.to_builtins(self._files())
-        checkpoint.state["facts"] = self.facts
+        checkpoint = to_checkpoint(snapshot, environments, self._files(), self.facts)
         path = save_checkpoint(self.folder / "checkpoints", self.run.moment(), checkpoint, snapshot.replay)
         return Saved(path, time.monotonic() - began)
 

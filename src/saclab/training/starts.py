@@ -11,7 +11,7 @@ import msgspec
 from saclab.config import Config
 from saclab.errors import UserError
 from saclab.files import write_json
-from saclab.machine import different_facts
+from saclab.machine import different_facts, other_simulation
 from saclab.records import FileRecord, RunDescription
 from saclab.replay import RowLayout
 from saclab.training.checkpoint import Checkpoint
@@ -90,6 +90,8 @@ def continued(
             f"the checkpoint has format {checkpoint.format}, of an earlier saclab: from here on the results differ in "
             "the last bits from what they would have been"
         )
+    if saved_facts and (reason := other_simulation(saved_facts.versions, facts["versions"])):
+        raise UserError(f"cannot continue {folder}: {reason}")
     notes += different_facts(msgspec.to_builtins(saved_facts), facts)
     return Beginning(start, logs, notes)
 

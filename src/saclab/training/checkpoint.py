@@ -41,6 +41,7 @@ from saclab.training.manifest import (
     newest_first,
     read_manifest,
     read_plain_file,
+    visible_checkpoints,
 )
 
 KEPT = 2
@@ -111,7 +112,7 @@ def save_checkpoint(folder: Path, moment: Moment, checkpoint: Checkpoint, replay
 
 def cannot_save(final: Path, error: OSError) -> str:
     """What happened, what is kept, and the way out."""
-    kept = newest_first(final.parent)
+    kept = visible_checkpoints(final.parent)
     reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error)
     return (
         f"cannot save {final}: {reason}. "

@@ -11,12 +11,19 @@ import msgspec
 from saclab.records import Damaged, Facts, read_json
 from saclab.replay import ReplayBuffer
 from saclab.training.checkpoint import Checkpoint, read_checkpoint, set_aside
-from saclab.training.manifest import CheckpointError, Moment, moment_of, newest_first, read_manifest
+from saclab.training.manifest import (
+    CheckpointError,
+    Moment,
+    moment_of,
+    newest_first,
+    read_manifest,
+    visible_checkpoints,
+)
 
 
 def checkpoint_moments(run: Path) -> list[Moment]:
     """The moments of a run folder's finished checkpoints, newest first; evaluated or not is all one."""
-    return [common_moment(path) for path in newest_first(run / "checkpoints")]
+    return [common_moment(path) for path in visible_checkpoints(run / "checkpoints")]
 
 
 def checkpoint_steps(run: Path) -> list[int]:
@@ -31,7 +38,7 @@ def common_moment(checkpoint: Path) -> Moment:
 
 def group_slots(run: Path) -> int:
     """Slots of the run group in which a run was saved last, or begun; 0 if it was not begun, or is alone."""
-    for path in newest_first(run / "checkpoints"):
+    for path in visible_checkpoints(run / "checkpoints"):
         with suppress(CheckpointError, msgspec.ValidationError):
             return msgspec.convert(read_manifest(path).state.get("facts"), Facts).machine.batch
     with suppress(Damaged):

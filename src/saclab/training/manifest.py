@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from saclab.errors import TrainingFailed
-from saclab.records import JSON_BYTES, Damaged, Formatted, Manifest, from_json, read_bytes
+from saclab.records import JSON_BYTES, Damaged, Formatted, Manifest, Unreadable, from_json, read_bytes
 
 FORMAT, OLDEST_FORMAT = 3, 1
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
@@ -55,8 +57,25 @@ def moment_of(checkpoint: Path) -> Moment:
 
 
 def newest_first(folder: Path) -> list[Path]:
-    """The finished checkpoints."""
-    return sorted((path for path in folder.glob("step-*") if moment_named(path.name)), key=moment_of, reverse=True)
+    """The finished checkpoints; none if there is no such folder.
+
+    Raises:
+        Unreadable: if it cannot be looked into. A run whose checkpoints were hidden must not begin anew.
+    """
+    try:
+        names = os.listdir(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise Unreadable(folder, error.strerror or error, "let this process read it") from error
+    return sorted((folder / name for name in names if moment_named(name)), key=moment_of, reverse=True)
+
+
+def visible_checkpoints(folder: Path) -> list[Path]:
+    """The same, for those who only look around; none where nothing can be seen."""
+    with suppress(Unreadable):
+        return newest_first(folder)
+    return []
 
 
 def read_manifest(folder: Path) -> Manifest:

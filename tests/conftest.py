@@ -47,11 +47,23 @@ SMALL = {
 }
 
 
-def variant_case(variant: str, network: str) -> AlgorithmSettings:
-    return dataclasses.replace(variant_settings(variant, "AnyEnvironment-v0"), network=network, **SMALL)
+def variant_case(variant: str) -> AlgorithmSettings:
+    """A variant with its own networks, small."""
+    own = variant_settings(variant, "AnyEnvironment-v0")
+    small = SMALL | {
+        "critic_hidden_layers": (9, 6) if own.critic_hidden_layers else None,
+        "critics": min(own.critics, 4),
+        "critic_atoms": 5,
+        "critic_dropout": 0.25 if own.critic_dropout else 0.0,
+        "actor_interval": min(own.actor_interval, 3),
+    }
+    return dataclasses.replace(own, **small)
 
 
-VARIANT_CASES = {f"{variant}/mlp": variant_case(variant, "mlp") for variant in VARIANTS}
+VARIANT_CASES = {
+    f"{variant}/{settings.network_of_critic}": settings
+    for variant, settings in ((variant, variant_case(variant)) for variant in VARIANTS)
+}
 MORE_CASES = {
     "three snapshots, three updates apart, mean for the actor": dataclasses.replace(
         VARIANT_CASES["averaged/mlp"], snapshots=3, snapshot_interval=3, actor_reduction="mean"
@@ -86,6 +98,9 @@ MORE_CASES = {
     "one pass for both states": dataclasses.replace(VARIANT_CASES["averaged-auto/mlp"], joint_forward=True),
     "a distribution over values, averaged": dataclasses.replace(
         VARIANT_CASES["averaged-auto/mlp"], critic_head="categorical", critic_atoms=7, critic_bound=2.0
+    ),
+    "quantiles, averaged, of two critics out of three": dataclasses.replace(
+        VARIANT_CASES["tqc/mlp"], critics=3, target_critics=2, snapshots=3, dropped_quantiles=1
     ),
     "batch normalisation in one pass without a target network": dataclasses.replace(
         VARIANT_CASES["sac-auto/mlp"],

@@ -9,10 +9,10 @@ from saclab.algorithm.heads import HEADS
 from saclab.algorithm.learner import UPDATES
 from saclab.algorithm.losses import FACTORS
 from saclab.algorithm.networks import NETWORKS
-from saclab.algorithm.networks.network import ACTIVATIONS, PROJECTIONS
+from saclab.algorithm.networks.network import ACTIVATIONS, INITIALISATIONS, PROJECTIONS
 from saclab.algorithm.optimizer import SCHEDULES
 from saclab.algorithm.scalars import ELSEWHERE, pack, scalars, unpack
-from saclab.algorithm.targets import REDUCTIONS
+from saclab.algorithm.targets import REDUCTIONS, TARGET_REDUCTIONS
 from saclab.errors import SettingError
 from saclab.settings import UPDATES as UPDATE_NAMES
 from saclab.settings import AlgorithmSettings, choices, plain_numbers, structure
@@ -23,15 +23,16 @@ TABLES = {
     "critic_network": NETWORKS,
     "critic_head": HEADS,
     "activation": ACTIVATIONS,
-    "target_reduction": REDUCTIONS,
+    "target_reduction": TARGET_REDUCTIONS,
     "actor_reduction": REDUCTIONS,
     "learning_rate_schedule": SCHEDULES,
     "temperature_gradient": FACTORS,
     "weight_projection": PROJECTIONS,
+    "initialisation": INITIALISATIONS,
     "reward_scaling": SCALES,
 }
 """Setting -> what its names stand for. `settings.py` imports no numerical library, so the names are written twice."""
-NO_TABLE = {"temperature"}  # two learning rates
+NO_TABLE = {"temperature", "critic_mode_for_actor"}  # two learning rates, two functions of a network
 
 
 @pytest.mark.parametrize("setting", TABLES)
@@ -56,6 +57,30 @@ def test_the_choices_are_those_of_the_hints():
 def test_a_name_that_is_not_known_is_refused_with_those_that_are(setting):
     with pytest.raises(SettingError, match=rf"{setting} = 'no such': use one of {choices()[setting][0]}, "):
         AlgorithmSettings(**{setting: "no such"})
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"target_critics": 3}, "target_critics = 3: use at most the number of critics, 2"),
+        ({"target_critics": 0}, "target_critics = 0: use a whole number of at least 1"),
+        ({"target_reduction": "truncated"}, "target_reduction = 'truncated': use it with critic_head quantile"),
+        (
+            {"target_reduction": "truncated", "critic_head": "quantile", "critic_atoms": 5, "dropped_quantiles": 5},
+            "dropped_quantiles = 5: use fewer than critic_atoms, 5",
+        ),
+        ({"critic_dropout": 0.1}, "critic_dropout = 0.1: use critic_network layer_norm_mlp: mlp has no dropout"),
+        ({"critic_dropout": 1.0, "network": "layer_norm_mlp"}, r"critic_dropout = 1.0: use a value in \[0, 1\)"),
+        (
+            {"initialisation": "xavier", "network": "batch_norm_mlp"},
+            "use network: batch_norm_mlp starts in",
+        ),
+        ({"critic_head": "quantile", "entropy_window": 10}, "use 1 together with critic_head quantile"),
+    ],
+)
+def test_critics_that_cannot_be_are_refused_with_the_way_out(settings, said):
+    with pytest.raises(SettingError, match=said):
+        AlgorithmSettings(**settings)
 
 
 def test_only_a_setting_that_may_be_left_out_can_be_none():

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from saclab.algorithm.networks import NETWORKS
+from saclab.algorithm.heads import HEADS
+from saclab.algorithm.networks import critic_network
 from saclab.algorithm.policy import make_policy
 from saclab.config import Config
 from saclab.errors import SettingError
@@ -40,10 +41,8 @@ def needed_memory(config: Config, layout: RowLayout) -> Needed:
 def network_numbers(settings: AlgorithmSettings, layout: RowLayout) -> int:
     """Numbers that belong to the networks; those of a `LearnerState` and of a gradient."""
     actor = make_policy(settings, layout.observation_size, layout.action_size).network.size
-    critic = settings.critics * NETWORKS[settings.network_of_critic](
-        layout.observation_size + layout.action_size, settings.layers_of_critic,
-        head_outputs(settings), settings.activation, settings.weight_projection,
-    ).size  # fmt: skip
+    inputs = layout.observation_size + layout.action_size
+    critic = settings.critics * critic_network(settings, inputs, head_outputs(settings)).size
     return 3 * (actor + critic) + settings.snapshots * critic + max(actor, critic)
 
 
@@ -58,13 +57,16 @@ def batch_numbers(settings: AlgorithmSettings, layout: RowLayout) -> int:
     of_critics = critics * rows * (2 * sum(widths) + settings.snapshots * max(widths))
     if settings.critic_head == "categorical":
         of_critics += size * settings.critic_atoms**2  # the distance of each value from each
+    if settings.critic_head == "quantile":
+        pooled = critics if settings.target_reduction == "truncated" else 1
+        of_critics += critics * size * settings.critic_atoms**2 * pooled  # of each quantile from each of the target
     rows = 2 * size if settings.actor_joint_forward else size
     of_policy = 2 * (rows * sum((*settings.hidden_layers, 2 * layout.action_size)) + critics * size * sum(widths))
     return max(of_critics, of_policy) + settings.entropy_window * size
 
 
 def head_outputs(settings: AlgorithmSettings) -> int:
-    return settings.critic_atoms if settings.critic_head == "categorical" else 1
+    return HEADS[settings.critic_head](settings).outputs
 
 
 WAYS_OUT = {

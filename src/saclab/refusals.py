@@ -33,6 +33,11 @@ def require_ranges(settings: AlgorithmSettings) -> None:
     check("critic_atoms", lambda value: value >= 2, "use a whole number of at least 2, such as 101")
     check("critic_bound", lambda value: value > 0, "use a value above 0, such as 5")
     check("final_learning_rate_share", lambda value: 0 <= value <= 1, "use a value in [0, 1], such as 0.5")
+    check("critic_dropout", lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.01")
+    check("dropped_quantiles", lambda value: value >= 0, "use a whole number of at least 0")
+    check(
+        "target_critics", lambda value: value is None or value >= 1, "use a whole number of at least 1, or leave it out"
+    )
     for name in ("batch_size", "critics", "snapshot_interval", "entropy_window", "actor_interval", "longest_noise"):
         check(name, lambda value: value >= 1, "use a whole number of at least 1")
     for name in ("critic_learning_rate", "actor_learning_rate", "temperature_learning_rate"):
@@ -65,18 +70,46 @@ def require_possible(settings: AlgorithmSettings) -> None:
         "term are two different algorithms",
     )  # fmt: skip
     require(
-        settings.critic_head != "categorical" or settings.entropy_window == 1,
+        settings.critic_head == "scalar" or settings.entropy_window == 1,
         "entropy_window", settings.entropy_window,
-        "use 1 together with critic_head categorical: it averages numbers, not distributions",
+        f"use 1 together with critic_head {settings.critic_head}: it averages numbers, not distributions",
     )  # fmt: skip
     require(
         len(settings.reward_weights) in (0, len(settings.reward_terms)),
         "reward_weights", " ".join(map(str, settings.reward_weights)),
         f"give one for each of the {len(settings.reward_terms)} reward_terms, or none",
     )  # fmt: skip
+    require_possible_critics(settings)
     order = settings.update_order
     require(
         sorted(order) == sorted(UPDATES) and order.index("actor") < order.index("temperature"),
         "update_order", " ".join(order),
         f"name each of {', '.join(UPDATES)} once, and actor before temperature, which is judged by its entropy",
+    )  # fmt: skip
+
+
+def require_possible_critics(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for critics that cannot be built or reduced as the settings say."""
+    require(
+        settings.target_critics is None or settings.target_critics <= settings.critics,
+        "target_critics", settings.target_critics, f"use at most the number of critics, {settings.critics}",
+    )  # fmt: skip
+    require(
+        settings.target_reduction != "truncated" or settings.critic_head == "quantile",
+        "target_reduction", settings.target_reduction,
+        f"use it with critic_head quantile: the head {settings.critic_head} has no quantiles to leave out",
+    )  # fmt: skip
+    require(
+        settings.target_reduction != "truncated" or settings.dropped_quantiles < settings.critic_atoms,
+        "dropped_quantiles", settings.dropped_quantiles, f"use fewer than critic_atoms, {settings.critic_atoms}",
+    )  # fmt: skip
+    require(
+        settings.critic_dropout == 0 or settings.network_of_critic == "layer_norm_mlp",
+        "critic_dropout", settings.critic_dropout,
+        f"use critic_network layer_norm_mlp: {settings.network_of_critic} has no dropout",
+    )  # fmt: skip
+    own = {settings.network, settings.network_of_critic} - {"mlp", "layer_norm_mlp"}
+    require(
+        settings.initialisation == "network" or not own,
+        "initialisation", settings.initialisation, f"use network: {', '.join(sorted(own))} starts in a way of its own",
     )  # fmt: skip

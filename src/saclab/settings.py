@@ -26,7 +26,7 @@ such settings only can be trained as one run group."""
 Whole = Annotated[int, PLAIN_NUMBER]
 
 Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
-NetworkName = Literal["mlp", "batch_norm_mlp"]
+NetworkName = Literal["mlp", "layer_norm_mlp", "batch_norm_mlp"]
 Reduction = Literal["minimum", "mean"]
 
 
@@ -62,15 +62,19 @@ class AlgorithmSettings:
     """Units of each hidden layer of the Q-networks; None is `hidden_layers`."""
     activation: Activation = "relu"
     """Non-linearity after each hidden layer."""
+    initialisation: Literal["network", "xavier"] = "network"
+    """How the weights start: as each network has it, or Xavier-uniform with biases of zero."""
     weight_projection: Literal["none", "unit_columns"] = "none"
     """What is done to the weight matrices after each step: nothing, or the weights into each unit are scaled to
     length 1."""
     critics: int = 2
     """Q-networks that are trained side by side."""
-    critic_head: Literal["scalar", "categorical"] = "scalar"
-    """What a Q-network predicts: a number, or a distribution over `critic_atoms` values."""
+    critic_dropout: float = 0.0
+    """Share of a Q-network's hidden units that are left out at random while it learns, in [0, 1)."""
+    critic_head: Literal["scalar", "categorical", "quantile"] = "scalar"
+    """What a Q-network predicts: a number, a distribution over `critic_atoms` values, or as many quantiles of one."""
     critic_atoms: int = 101
-    """Values of the categorical head, evenly spaced from −`critic_bound` to `critic_bound`."""
+    """Values of the categorical head, evenly spaced from −`critic_bound` to `critic_bound`; quantiles of that head."""
     critic_bound: float = 5.0
     """The largest value that the categorical head can represent."""
     joint_forward: bool = False
@@ -88,10 +92,18 @@ class AlgorithmSettings:
     entropy_window: int = 1
     """Minibatches over which α·log π of the target is averaged row by row, from zeros: what the paper's authors
     ran as "Averaged-SAC". The rows are unrelated to each other; this is not Eq. 9. 1 is plain SAC."""
-    target_reduction: Reduction = "minimum"
-    """How the critics are reduced to one Q in the target (Eq. 4)."""
+    target_critics: int | None = None
+    """Critics, drawn anew for each update, whose targets value the next state; None is all of them."""
+    target_reduction: Literal["minimum", "mean", "truncated"] = "minimum"
+    """How the critics are reduced to one Q in the target (Eq. 4); truncated: the quantiles of all of them together,
+    without the largest."""
+    dropped_quantiles: int = 2
+    """Quantiles per critic that the truncated target leaves out."""
     actor_reduction: Reduction = "minimum"
     """How the critics are reduced to one Q in the policy loss (Eq. 5)."""
+    critic_mode_for_actor: Literal["evaluation", "training"] = "evaluation"
+    """How the critics run in the policy loss: as they act, or as they learn, with dropout and the batch's own
+    statistics."""
 
     update_order: tuple[str, ...] = UPDATES
     """Order of the parts of an update; each sees what those before it have changed."""

@@ -36,6 +36,17 @@ class Variant:
 
 LEARNED = {"temperature": "learned", "initial_temperature": 1.0}
 AVERAGED = {"snapshots": 10}
+ENSEMBLE = LEARNED | {
+    "actor_reduction": "mean",
+    "initialisation": "xavier",
+    "updates_per_interval": 20,
+    "update_interval": 1,
+    "actor_interval": 20,
+    "random_steps": 5_000,
+}
+"""What REDQ and DroQ share: many updates per environment step, the policy's at every twentieth."""
+ENSEMBLE_ENTROPY = {"Hopper-": -1.0, "HalfCheetah-": -3.0, "Walker2d-": -3.0, "Ant-": -4.0, "Humanoid-": -2.0}
+"""Target entropies of MBPO, REDQ and DroQ."""
 
 COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
 """The variants of a comparison, unless others are asked for."""
@@ -68,6 +79,37 @@ VARIANTS: dict[str, Variant] = {
         "What the paper's authors ran under the name Averaged-SAC: no value is averaged, only the entropy term "
         "α·log π, row by row over the last K unrelated minibatches. Kept to check their published numbers.",
         {"entropy_window": 10},
+    ),
+    "redq": Variant(
+        "REDQ",
+        "Ten critics; the target takes the smaller of two drawn at random, the policy the mean of all; 20 updates per "
+        "step.",
+        ENSEMBLE | {"critics": 10, "target_critics": 2},
+        {prefix: {"target_entropy": entropy} for prefix, entropy in ENSEMBLE_ENTROPY.items()},
+        source="Chen et al. 2021",
+    ),
+    "droq": Variant(
+        "DroQ",
+        "REDQ with two critics that have dropout and layer normalisation.",
+        ENSEMBLE | {"critic_network": "layer_norm_mlp", "critic_dropout": 0.01, "critic_mode_for_actor": "training"},
+        {prefix: {"target_entropy": entropy} for prefix, entropy in ENSEMBLE_ENTROPY.items()}
+        | {"Humanoid-": {"target_entropy": -2.0, "critic_dropout": 0.1}},
+        source="Hiraoka et al. 2022",
+    ),
+    "tqc": Variant(
+        "TQC",
+        "Five critics of 25 quantiles; the target pools them and leaves out the largest, the policy takes the mean.",
+        LEARNED
+        | {
+            "critic_head": "quantile",
+            "critic_atoms": 25,
+            "critics": 5,
+            "critic_hidden_layers": (512, 512, 512),
+            "target_reduction": "truncated",
+            "actor_reduction": "mean",
+        },
+        {"HalfCheetah-": {"dropped_quantiles": 0}, "Hopper-": {"dropped_quantiles": 5}},
+        source="Kuznetsov et al. 2020",
     ),
 }
 

@@ -72,3 +72,21 @@ def test_the_categorical_prediction_sums_to_one_for_any_outputs():
     outputs = np.array([[1000.0, 0.0, -1000.0], [0.0, 0.0, 0.0]], np.float32)
     prediction = head("categorical", critic_atoms=3).prediction(outputs)
     np.testing.assert_allclose(prediction, [[1, 0, 0], [1 / 3] * 3], atol=1e-6)
+
+
+def test_the_quantile_loss_weighs_each_error_by_the_level_of_its_quantile():
+    """The quantiles 0 and 2, at the levels ¼ and ¾, towards 1 and 4."""
+    outputs, target = jnp.array([[[0.0, 2.0]]]), jnp.array([[1.0, 4.0]])
+    # errors of 0: 1 and 4 -> ¼ · ½ and ¼ · 3.5; of 2: −1 and 2 -> ¼ · ½ and ¾ · 1.5
+    assert head("quantile", critic_atoms=2).loss(outputs, target) == 0.5625
+    # slopes: −¼ · (1 + 1) and ¼ · 1 − ¾ · 1, each over four pairs
+    slope = jax.grad(head("quantile", critic_atoms=2).loss)(outputs, target)
+    assert slope.tolist() == [[[-0.125, -0.125]]]
+    assert head("quantile", critic_atoms=2).loss(jnp.repeat(outputs, 3, axis=0), target) == 3 * 0.5625
+
+
+def test_the_quantile_target_moves_every_quantile():
+    quantiles, reward, discount = jnp.array([[1.0, 3.0]] * 2), jnp.array([1.0, 1.0]), jnp.array([0.5, 0.0])
+    target = head("quantile", critic_atoms=2).backup(quantiles, reward, discount, jnp.array([1.0, 1.0]))
+    assert target.tolist() == [[1.0, 2.0], [1.0, 1.0]]
+    assert head("quantile", critic_atoms=2).mean(target).tolist() == [1.5, 1.0]

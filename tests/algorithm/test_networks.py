@@ -11,7 +11,8 @@ import pytest
 
 from saclab.algorithm.networks import NETWORKS
 from saclab.algorithm.networks.batch_norm_mlp import EPSILON, MOMENTUM, batch_norm_mlp, normalise
-from saclab.algorithm.networks.network import ACTIVATIONS
+from saclab.algorithm.networks.layer_norm_mlp import dropped_out
+from saclab.algorithm.networks.network import ACTIVATIONS, INITIALISATIONS, Design
 
 
 @pytest.mark.parametrize("name", ACTIVATIONS)
@@ -22,7 +23,7 @@ def test_an_activation_is_the_one_of_its_name(name):
 
 
 def test_an_mlp_by_hand():
-    network = NETWORKS["mlp"](2, (2,), 1, "relu", "none")
+    network = NETWORKS["mlp"](2, (2,), 1, Design("relu"))
     #              [[1, -1], [2, 0]]      [0, 3]     [[1], [-2]]  [0.5]
     parameters = np.array([1.0, -1.0, 2.0, 0.0, 0.0, 3.0, 1.0, -2.0, 0.5])
     assert network.size == len(parameters)
@@ -31,7 +32,7 @@ def test_an_mlp_by_hand():
 
 
 def test_inputs_that_belong_side_by_side_may_come_apart():
-    network = NETWORKS["mlp"](3, (5,), 2, "tanh", "none")
+    network = NETWORKS["mlp"](3, (5,), 2, Design("tanh"))
     parameters = np.asarray(network.init(jax.random.PRNGKey(0)))
     x = np.random.default_rng(0).standard_normal((4, 3)).astype(np.float32)
     whole = network.apply(parameters, x)
@@ -45,7 +46,7 @@ def test_inputs_that_belong_side_by_side_may_come_apart():
 
 def test_weights_start_uniform_within_one_over_the_root_of_the_inputs():
     """So do the biases."""
-    network = NETWORKS["mlp"](100, (400,), 1, "relu", "none")
+    network = NETWORKS["mlp"](100, (400,), 1, Design("relu"))
     first = np.asarray(network.init(jax.random.PRNGKey(0)))[: 101 * 400]
     assert np.abs(first).max() == pytest.approx(0.1, rel=1e-3)
     assert first.std() == pytest.approx(0.1 / math.sqrt(3), rel=0.02)
@@ -68,7 +69,7 @@ def batch(rows: int = 6) -> np.ndarray:
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("projection", ["none", "unit_columns"])
 def test_a_network_has_the_shapes_it_says(name, projection):
-    network = NETWORKS[name](3, (5, 4), 2, "relu", projection)
+    network = NETWORKS[name](3, (5, 4), 2, Design("relu", projection))
     vector = network.init(KEY)
     outputs, statistics = network.train(vector, batch(), key=KEY)
     assert vector.shape == network.project(vector).shape == (network.size,)
@@ -79,7 +80,7 @@ def test_a_network_has_the_shapes_it_says(name, projection):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_network_acts_the_same_in_numpy_and_in_jax(name):
-    network = NETWORKS[name](3, (5, 4), 2, "elu", "none")
+    network = NETWORKS[name](3, (5, 4), 2, Design("elu"))
     vector = random_vector(network)
     ours = network.apply(vector, batch())
     assert isinstance(ours, np.ndarray)
@@ -88,7 +89,7 @@ def test_a_network_acts_the_same_in_numpy_and_in_jax(name):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_unit_columns_have_length_one_and_leave_the_rest(name):
-    network = NETWORKS[name](3, (4,), 2, "relu", "unit_columns")
+    network = NETWORKS[name](3, (4,), 2, Design("relu", "unit_columns"))
     vector = random_vector(network)
     first = np.asarray(network.project(vector))[:12].reshape(3, 4)
     np.testing.assert_allclose((first**2).sum(axis=0), 1, rtol=1e-5)
@@ -106,7 +107,7 @@ def test_joint_statistics_by_hand():
 
 
 def test_running_statistics_move_by_one_hundredth():
-    network = batch_norm_mlp(3, (4,), 1, "relu")
+    network = batch_norm_mlp(3, (4,), 1, Design())
     _, statistics = network.train(network.init(KEY), batch(), key=KEY)
     inputs = np.asarray(statistics[:6]).reshape(2, 3)  # of the inputs; they start at 0 and 1
     np.testing.assert_allclose(inputs[0], (1 - MOMENTUM) * batch().mean(axis=0), rtol=1e-4)
@@ -114,7 +115,7 @@ def test_running_statistics_move_by_one_hundredth():
 
 
 def test_with_the_statistics_of_its_batch_a_network_acts_as_it_learns():
-    network = batch_norm_mlp(3, (4,), 2, "relu")
+    network = batch_norm_mlp(3, (4,), 2, Design())
     vector = random_vector(network)
     learning, statistics = network.train(vector, batch(), key=KEY)
     running = vector[network.size - network.statistics :]
@@ -137,7 +138,7 @@ def straight_line(vector: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def test_batch_normalisation_and_its_gradient_equal_the_reference():
-    network = batch_norm_mlp(3, (4,), 2, "relu")
+    network = batch_norm_mlp(3, (4,), 2, Design())
     vector, x = random_vector(network).astype(np.float64), batch().astype(np.float64)
     weight = np.random.default_rng(2).standard_normal((6, 2))
     parameters = network.size - network.statistics
@@ -157,3 +158,38 @@ def test_batch_normalisation_and_its_gradient_equal_the_reference():
         expected = (loss(vector + change) - loss(vector - change)) / 2e-6
         assert slope[index] == pytest.approx(expected, rel=1e-3, abs=1e-3), index
     assert not slope[parameters:].any()  # no gradient goes through the running statistics
+
+
+def test_a_layer_norm_mlp_by_hand():
+    network = NETWORKS["layer_norm_mlp"](2, (2,), 1, Design(dropout=0.5))
+    #              [[1, -1], [2, 0]]      [0, 3]     [[1], [-2]]  [0.5] scale: 3, 4; shift: 1, 5
+    parameters = np.array([1.0, -1.0, 2.0, 0.0, 0.0, 3.0, 1.0, -2.0, 0.5, 3.0, 4.0, 1.0, 5.0])
+    assert network.size == len(parameters)
+    # (1, 1): 3, 2, normalised 1, -1 -> 4, 1 -> 4 - 2 + 0.5;   (-1, 0): -1, 4, normalised -1, 1 -> 0, 9 -> -18 + 0.5
+    outputs = network.apply(parameters, np.array([[1.0, 1.0], [-1.0, 0.0]]))
+    np.testing.assert_allclose(outputs, [[2.5], [-17.5]], rtol=1e-4)
+
+
+def test_dropout_leaves_out_its_share_and_keeps_the_mean():
+    left = np.asarray(dropped_out(jnp.full((200, 500), 3.0), KEY, 0.25))
+    assert set(np.unique(left)) == {0.0, 4.0}
+    assert (left == 0).mean() == pytest.approx(0.25, abs=0.007)  # five standard deviations
+    assert len(np.unique((left == 0).sum(axis=0))) > 10, "each unit is left out by itself"
+
+
+def test_dropout_acts_while_a_network_learns_only():
+    network = NETWORKS["layer_norm_mlp"](3, (5, 4), 2, Design(dropout=0.5))
+    vector = jnp.asarray(random_vector(network))
+    learning = [np.asarray(network.train(vector, batch(), key=key)[0]) for key in (KEY, jax.random.PRNGKey(9))]
+    assert np.abs(learning[0] - learning[1]).max() > 0.01
+    without = NETWORKS["layer_norm_mlp"](3, (5, 4), 2, Design())
+    learnt, _ = without.train(vector, batch(), key=KEY)
+    np.testing.assert_array_equal(learnt, network.apply(vector, jnp.asarray(batch())))
+
+
+def test_xavier_weights_are_uniform_up_to_their_bound_and_biases_zero():
+    layer = np.asarray(INITIALISATIONS["xavier"](KEY, 100, 500))
+    weights, bias = layer[:50_000], layer[50_000:]
+    assert np.abs(weights).max() == pytest.approx(0.1, rel=1e-3)  # √(6 / 600)
+    assert weights.std() == pytest.approx(0.1 / 3**0.5, rel=0.02)
+    assert not bias.any()

@@ -7,7 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from saclab.algorithm.targets import REDUCTIONS, averaged_entropy, averaged_prediction, live_slot, polyak_update
+from saclab.algorithm.targets import (
+    REDUCTIONS,
+    TARGET_REDUCTIONS,
+    averaged_entropy,
+    averaged_prediction,
+    live_slot,
+    polyak_update,
+)
+from saclab.settings import AlgorithmSettings
 
 
 @pytest.fixture(autouse=True)
@@ -53,6 +61,13 @@ def test_the_minimum_is_the_prediction_of_the_critic_with_the_smaller_q():
     predictions = jnp.array([[[0.0, 1.0], [0.5, 0.5]], [[0.75, 0.25], [0.0, 1.0]]])  # [C, B, n], values 0 and 1
     q = predictions @ jnp.array([0.0, 1.0])
     assert REDUCTIONS["minimum"](predictions, q).tolist() == [[0.75, 0.25], [0.5, 0.5]]
+
+
+def test_the_truncated_target_pools_all_quantiles_without_the_largest():
+    settings = AlgorithmSettings(critic_head="quantile", critic_atoms=3, dropped_quantiles=1)
+    quantiles = jnp.array([[[1.0, 3.0, 2.0]], [[30.0, 10.0, 20.0]]])
+    pooled = TARGET_REDUCTIONS["truncated"](settings)(quantiles, jnp.mean(quantiles, axis=-1))
+    assert pooled.tolist() == [[1.0, 2.0, 3.0, 10.0]]  # mean 4
 
 
 @pytest.mark.parametrize("name", REDUCTIONS)

@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +21,8 @@ Layers = list[tuple[np.ndarray, np.ndarray]]
 """Weights [inputs, outputs] and bias [outputs] of each layer."""
 
 
-def forward(layers: Layers, x: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Output of a ReLU perceptron, and the input of each layer."""
+def forward(layers: Layers, x: np.ndarray, masks: None = None) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Output of a ReLU perceptron, and the input of each layer. It has no dropout, so no masks."""
     inputs = []
     for number, (weights, bias) in enumerate(layers):
         inputs.append(x)
@@ -153,22 +154,90 @@ class CategoricalHead:
         return probability * (self.values - (probability @ self.values)[:, None])
 
 
+class QuantileHead:
+    """The outputs are quantiles at the levels (i + ½)/n."""
+
+    def __init__(self, atoms: int) -> None:
+        self.levels = [(i + 0.5) / atoms for i in range(atoms)]
+
+    def predict(self, outputs: np.ndarray) -> np.ndarray:
+        return outputs
+
+    def q(self, outputs: np.ndarray) -> np.ndarray:
+        return outputs.mean(axis=1)
+
+    q_of_prediction = q
+
+    def target(self, prediction: np.ndarray, reward, discount, entropy_term) -> np.ndarray:
+        return reward[:, None] + discount[:, None] * (prediction - entropy_term[:, None])
+
+    def loss(self, outputs: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray]:
+        """Row by row, quantile by quantile, number by number."""
+        total, slope = 0.0, np.zeros_like(outputs)
+        pairs = outputs.size * target.shape[1]
+        for row, quantiles in enumerate(outputs):
+            for i, (quantile, level) in enumerate(zip(quantiles, self.levels, strict=True)):
+                for error in target[row] - quantile:
+                    weight = abs(level - (error < 0))
+                    total += weight * (error**2 / 2 if abs(error) <= 1 else abs(error) - 0.5) / pairs
+                    slope[row, i] -= weight * max(-1.0, min(1.0, error)) / pairs
+        return total, slope
+
+    def d_q(self, outputs: np.ndarray) -> np.ndarray:
+        return np.full_like(outputs, 1 / outputs.shape[1])
+
+
+def reduced(name: str, predictions: np.ndarray, q: np.ndarray, dropped: int) -> np.ndarray:
+    """One prediction of all critics', [critics, rows, n]."""
+    if name == "minimum":
+        return predictions[q.argmin(axis=0), np.arange(q.shape[1])]
+    if name == "mean":
+        return predictions.mean(axis=0)
+    rows = [sorted(value for critic in predictions[:, row] for value in critic) for row in range(q.shape[1])]
+    return np.array([values[: len(values) - dropped * len(predictions)] for values in rows])
+
+
+@dataclass
+class Draws:
+    """What an update draws at random."""
+
+    next_noise: np.ndarray
+    """Of the next actions, [rows, action]."""
+    actor_noise: np.ndarray
+    chosen: list[int]
+    """The critics that value the next state."""
+    critic_masks: list
+    """Dropout of each critic that learns, as its network takes it."""
+    target_masks: list
+    """Of each chosen critic, in every snapshot."""
+    actor_masks: list
+    """Of each critic in the policy's loss."""
+
+
 class NumpySac:
     """The state of a learner and its update."""
 
     def __init__(
-        self, actor: Layers, critics: list[Layers], settings: AlgorithmSettings, target_entropy: float, updates: int
+        self,
+        actor: Layers,
+        critics: list[Layers],
+        settings: AlgorithmSettings,
+        target_entropy: float,
+        updates: int,
+        critic_network: Any = None,
     ) -> None:
-        """`updates` is the length of the learning rates' schedule."""
+        """`updates` is the length of the learning rates' schedule; `critic_network` a module with `forward` and
+        `backward`, if the critics are no perceptrons.
+        """
+        self.critic_forward = critic_network.forward if critic_network else forward
+        self.critic_backward = critic_network.backward if critic_network else backward
         self.actor, self.critics, self.settings = actor, critics, settings
         self.log_alpha = math.log(settings.initial_temperature)
         self.target_entropy = target_entropy
         self.log_std_range = settings.log_std_minimum, settings.log_std_maximum
-        self.head = (
-            ScalarHead()
-            if settings.critic_head == "scalar"
-            else CategoricalHead(settings.critic_atoms, settings.critic_bound)
-        )
+        atoms, bound = settings.critic_atoms, settings.critic_bound
+        heads = {"scalar": ScalarHead, "categorical": lambda: CategoricalHead(atoms, bound)}
+        self.head = (heads | {"quantile": lambda: QuantileHead(atoms)})[settings.critic_head]()
         self.targets: list[list[Layers]] = [critics]
         """The target critics after 0, 1, 2, … updates."""
         window = settings.entropy_window
@@ -213,17 +282,16 @@ class NumpySac:
         reward: np.ndarray,
         next_observation: np.ndarray,
         terminated: np.ndarray,
-        next_noise: np.ndarray,
-        actor_noise: np.ndarray,
+        draws: Draws,
     ) -> dict[str, float]:
         """One update of everything; what it reports."""
         self.report["temperature"] = math.exp(self.log_alpha)
         acts = self.updates % self.settings.actor_interval == 0
         for part in self.settings.update_order:
             if part == "critic":
-                self.update_critic(observation, action, reward, next_observation, terminated, next_noise)
+                self.update_critic(observation, action, reward, next_observation, terminated, draws)
             if part == "actor" and acts:
-                self.update_actor(observation, actor_noise)
+                self.update_actor(observation, draws)
             if part == "temperature" and acts:
                 self.update_temperature()
             if part == "targets":
@@ -231,27 +299,29 @@ class NumpySac:
         self.updates += 1
         return self.report
 
-    def update_critic(self, observation, action, reward, next_observation, terminated, noise) -> None:
+    def update_critic(self, observation, action, reward, next_observation, terminated, draws) -> None:
         # Eq. 4 and 9: the value of the next state.
-        next_action, next_log_prob, _ = self.sample(next_observation, noise)
-        reduced, rows = [], np.arange(len(reward))
+        next_action, next_log_prob, _ = self.sample(next_observation, draws.next_noise)
+        values = []
         for target in self.averaged_targets():
-            outputs = [forward(layers, np.hstack([next_observation, next_action]))[0] for layers in target]
+            outputs = [
+                self.critic_forward(target[i], np.hstack([next_observation, next_action]), masks)[0]
+                for i, masks in zip(draws.chosen, draws.target_masks, strict=True)
+            ]
             predictions = np.array([self.head.predict(output) for output in outputs])
             q = np.array([self.head.q(output) for output in outputs])
-            smallest = self.settings.target_reduction == "minimum"
-            reduced.append(predictions[q.argmin(axis=0), rows] if smallest else predictions.mean(axis=0))
-        prediction = sum(reduced) / len(reduced)
+            values.append(reduced(self.settings.target_reduction, predictions, q, self.settings.dropped_quantiles))
+        prediction = sum(values) / len(values)
         self.entropy_terms.append(math.exp(self.log_alpha) * next_log_prob)
         entropy_term = sum(self.entropy_terms) / len(self.entropy_terms)
         y = self.head.target(prediction, reward, self.settings.discount * (1 - terminated), entropy_term)
 
         # Eq. 3: each critic towards y.
         critic_loss, predicted, changed = 0.0, [], []
-        for layers, adam in zip(self.critics, self.critic_adams, strict=True):
-            outputs, inputs = forward(layers, np.hstack([observation, action]))
+        for layers, adam, masks in zip(self.critics, self.critic_adams, draws.critic_masks, strict=True):
+            outputs, kept = self.critic_forward(layers, np.hstack([observation, action]), masks)
             loss, d_outputs = self.head.loss(outputs, y)
-            gradients, _ = backward(layers, inputs, d_outputs)
+            gradients, _ = self.critic_backward(layers, kept, d_outputs)
             changed.append(adam.step_layers(layers, gradients))
             predicted.append(self.head.q(outputs))
             critic_loss += loss
@@ -261,23 +331,26 @@ class NumpySac:
             "q_mean": np.mean(predicted),
             "q_spread": np.mean(np.std(predicted, axis=0)),
             "target_mean": np.mean(self.head.q_of_prediction(y)),
-            "snapshot_spread": np.mean(np.std([self.head.q_of_prediction(one) for one in reduced], axis=0)),
+            "snapshot_spread": np.mean(np.std([self.head.q_of_prediction(one) for one in values], axis=0)),
         }
 
-    def update_actor(self, observation, noise) -> None:
+    def update_actor(self, observation, draws) -> None:
         # Eq. 5 on the critics as they are now: the actor, through the reparametrised action.
-        batch, alpha = len(observation), math.exp(self.log_alpha)
+        batch, alpha, noise = len(observation), math.exp(self.log_alpha), draws.actor_noise
         sampled, log_prob, (inputs, log_std, inside) = self.sample(observation, noise)
-        passes = [forward(layers, np.hstack([observation, sampled])) for layers in self.critics]
+        passes = [
+            self.critic_forward(layers, np.hstack([observation, sampled]), masks)
+            for layers, masks in zip(self.critics, draws.actor_masks, strict=True)
+        ]
         q = np.array([self.head.q(output) for output, _ in passes])
         if self.settings.actor_reduction == "minimum":
             share = (np.arange(len(q))[:, None] == q.argmin(axis=0)).astype(float)
         else:
             share = np.full_like(q, 1 / len(q))
         d_action = np.zeros_like(sampled)
-        for layers, (outputs, critic_inputs), weight in zip(self.critics, passes, share, strict=True):
+        for layers, (outputs, kept), weight in zip(self.critics, passes, share, strict=True):
             d_outputs = -weight[:, None] / batch * self.head.d_q(outputs)
-            _, d_input = backward(layers, critic_inputs, d_outputs)
+            _, d_input = self.critic_backward(layers, kept, d_outputs)
             d_action += d_input[:, observation.shape[1] :]
         d_u = d_action * (1 - sampled**2) + alpha / batch * 2 * sampled  # d log π / du = 2 tanh u
         d_log_std = (d_u * np.exp(log_std) * noise - alpha / batch) * inside

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from saclab.algorithm.networks.mlp import mlp
+from saclab.algorithm.networks.network import Design
 from saclab.training.process import compiled
 
 INPUTS, CRITICS = 23, 2
@@ -46,7 +47,7 @@ def reference_gradients(vector, sizes, x) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("rows", ROWS)
 def test_products_and_their_gradients_are_right_in_every_row(rows, hidden):
     """tanh, since rounding alone turns a unit of relu off here and there, which is as much as a wrong row."""
-    network, generator = mlp(INPUTS, hidden, 1, "tanh"), np.random.default_rng(0)
+    network, generator = mlp(INPUTS, hidden, 1, Design("tanh")), np.random.default_rng(0)
     critics = np.asarray(jax.vmap(network.init)(jax.random.split(jax.random.PRNGKey(1), CRITICS)))
     x = generator.standard_normal((rows, INPUTS)).astype(np.float32)
 

@@ -1,4 +1,7 @@
-"""What a Q-network predicts: a number, or a distribution over values. C: critics, n: outputs of a head."""
+"""What a Q-network predicts: a number, a distribution over values, or quantiles of one.
+
+C: critics, n: outputs of a head, m: numbers of a target, which is n unless the critics were pooled.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,10 @@ class CriticHead(NamedTuple):
     mean: Callable[[Array], Array]
     """Prediction f32[..., n] -> Q f32[...]."""
     backup: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
-    """(prediction of the next state f32[B, n], reward f32[B], discount f32[B], entropy term f32[B]) -> the prediction
-    f32[B, n] that R + γ (Z(s′, a′) − α log π) has. `discount` is 0 after a terminal state."""
+    """(prediction of the next state f32[B, m], reward f32[B], discount f32[B], entropy term f32[B]) -> the prediction
+    f32[B, m] that R + γ (Z(s′, a′) − α log π) has. `discount` is 0 after a terminal state."""
     loss: Callable[[jax.Array, jax.Array], jax.Array]
-    """(outputs f32[C, B, n], target f32[B, n]) -> f32[], summed over the critics."""
+    """(outputs f32[C, B, n], target f32[B, m]) -> f32[], summed over the critics."""
 
 
 def scalar(settings: AlgorithmSettings) -> CriticHead:
@@ -66,4 +69,29 @@ def categorical(settings: AlgorithmSettings) -> CriticHead:
     return CriticHead(atoms, prediction, lambda probability: probability @ values, backup, loss)
 
 
-HEADS: dict[str, Callable[[AlgorithmSettings], CriticHead]] = {"scalar": scalar, "categorical": categorical}
+def quantile(settings: AlgorithmSettings) -> CriticHead:
+    """Quantiles at the levels (i + ½)/n; the loss is that of QR-DQN with κ = 1 (Dabney et al. 2018)."""
+    levels = (np.arange(settings.critic_atoms, dtype=np.float32) + np.float32(0.5)) / np.float32(settings.critic_atoms)
+
+    def mean(quantiles: Array) -> Array:
+        return quantiles.__array_namespace__().mean(quantiles, axis=-1)
+
+    def backup(quantiles: jax.Array, reward: jax.Array, discount: jax.Array, entropy_term: jax.Array) -> jax.Array:
+        return reward[:, None] + discount[:, None] * (quantiles - entropy_term[:, None])
+
+    def loss(outputs: jax.Array, target: jax.Array) -> jax.Array:
+        """The mean over the batch and all pairs of a quantile and a number of the target."""
+        error = target[None, :, None, :] - outputs[..., None]  # f32[C, B, n, m]
+        size = jnp.abs(error)
+        huber = jnp.where(size > 1, size - 0.5, 0.5 * error * error)
+        weight = jnp.where(error < 0, 1 - levels[:, None], levels[:, None])
+        return jnp.sum(jnp.mean(weight * huber, axis=(1, 2, 3)))
+
+    return CriticHead(settings.critic_atoms, lambda outputs: outputs, mean, backup, loss)
+
+
+HEADS: dict[str, Callable[[AlgorithmSettings], CriticHead]] = {
+    "scalar": scalar,
+    "categorical": categorical,
+    "quantile": quantile,
+}

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from saclab.algorithm.heads import HEADS, CriticHead
 from saclab.algorithm.losses import actor_loss, temperature_loss
 from saclab.algorithm.metrics import METRICS
-from saclab.algorithm.networks import NETWORKS
+from saclab.algorithm.networks import critic_network
 from saclab.algorithm.networks.network import Array, Network
 from saclab.algorithm.optimizer import Trainer, descend
 from saclab.algorithm.policy import Policy, make_policy
 from saclab.algorithm.scalars import Scalars
-from saclab.algorithm.targets import REDUCTIONS, averaged_entropy, averaged_prediction, polyak_update, reduced_q
+from saclab.algorithm.targets import TARGET_REDUCTIONS, averaged_entropy, averaged_prediction, polyak_update, reduced_q
 from saclab.algorithm.types import Batch, Context, LearnerState
 from saclab.settings import AlgorithmSettings
 
@@ -58,10 +58,24 @@ class Parts(NamedTuple):
         """Standard normal, f32[B, A]."""
         return jax.random.normal(key, (observation.shape[0], self.action_size))
 
-    def q_outputs(self, critic: jax.Array, *state_and_action: jax.Array) -> jax.Array:
-        """Outputs f32[C, B, n] of critics f32[C, P] as they act, on s and a in one array or in two."""
-        each: Callable[[jax.Array], jax.Array] = jax.vmap(lambda row: self.q_network.apply(row, *state_and_action))
-        return each(critic)
+    def q_outputs(self, critic: jax.Array, state: jax.Array, action: jax.Array, key: jax.Array) -> jax.Array:
+        """Outputs f32[C, B, n] of critics f32[C, P], for the policy's loss."""
+
+        def evaluated(row: jax.Array, key: jax.Array) -> Array:
+            return self.q_network.apply(row, state, action)
+
+        def trained(row: jax.Array, key: jax.Array) -> Array:
+            return self.q_network.train(row, state, action, key=key)[0]
+
+        each = jax.vmap({"evaluation": evaluated, "training": trained}[self.settings.critic_mode_for_actor])
+        outputs: jax.Array = each(critic, jax.random.split(key, len(critic)))
+        return outputs
+
+    def chosen_critics(self, key: jax.Array) -> jax.Array | slice:
+        """Which critics value the next state: all, or `target_critics` of them, drawn without replacement."""
+        if self.settings.target_critics is None:
+            return slice(None)
+        return jax.random.permutation(key, self.settings.critics)[: self.settings.target_critics]
 
     def q(self, outputs: jax.Array) -> jax.Array:
         """f32[...] for outputs f32[..., n] of the Q-network."""
@@ -75,10 +89,7 @@ def make_learner(settings: AlgorithmSettings, observation_size: int, action_size
     Their plain numbers play no part: they are arguments of `init` and `update` (`scalars`).
     """
     head, policy = HEADS[settings.critic_head](settings), make_policy(settings, observation_size, action_size)
-    q_network = NETWORKS[settings.network_of_critic](
-        observation_size + action_size, settings.layers_of_critic, head.outputs, settings.activation,
-        settings.weight_projection,
-    )  # fmt: skip
+    q_network = critic_network(settings, observation_size + action_size, head.outputs)
     schedule = settings.learning_rate_schedule
     parts = Parts(
         settings=settings,
@@ -125,6 +136,8 @@ def update(parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, co
 
 
 FOR_NETWORKS = 1  # folded into the key of a noise, it is that of the networks that draw something while they learn
+FOR_CRITICS = 2  # likewise: of the critics in the policy's loss
+FOR_CHOICE = 3  # likewise: of the critics that value the next state
 Passes = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 Update = Callable[[Parts, Scalars, LearnerState, Batch, Context, jax.Array], LearnerState]
 
@@ -135,6 +148,7 @@ def update_critic(
     """Eq. 3 with the value of Eq. 4 or 9."""
     key, _ = jax.random.split(key)
     network_key = jax.random.fold_in(key, FOR_NETWORKS)
+    chosen = parts.chosen_critics(jax.random.fold_in(key, FOR_CHOICE))
     next_noise = parts.noise(batch.next_observation, key)
     next_action, next_log_prob = parts.policy.sample(state.actor.weights, batch.next_observation, next_noise)
     entropy_term, entropy_terms = averaged_entropy(
@@ -144,9 +158,11 @@ def update_critic(
     discount = numbers["discount"] * (1 - batch.terminated)
 
     def objective(critic: jax.Array) -> tuple[jax.Array, tuple[jax.Array, dict[str, jax.Array]]]:
-        outputs, next_outputs, statistics = forward(parts, critic, state.targets, batch, next_action, network_key)
+        outputs, next_outputs, statistics = forward(
+            parts, critic, state.targets[:, chosen], batch, next_action, chosen, network_key
+        )
         predictions = parts.head.prediction(next_outputs)
-        reduce = REDUCTIONS[parts.settings.target_reduction]
+        reduce = TARGET_REDUCTIONS[parts.settings.target_reduction](parts.settings)
         prediction, snapshot_spread = averaged_prediction(predictions, parts.head.mean, reduce)
         target = jax.lax.stop_gradient(parts.head.backup(prediction, reward, discount, entropy_term))
         loss, q = parts.head.loss(outputs, target), parts.q(outputs)
@@ -165,13 +181,20 @@ def update_critic(
 
 
 def forward(
-    parts: Parts, critic: jax.Array, targets: jax.Array, batch: Batch, next_action: jax.Array, key: jax.Array
+    parts: Parts,
+    critic: jax.Array,
+    targets: jax.Array,
+    batch: Batch,
+    next_action: jax.Array,
+    chosen: jax.Array | slice,
+    key: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """All passes of the Q-networks that a critic's update needs.
 
     Returns:
-        The critics' outputs f32[C, B, n] on (s, a); those on (s′, a′) of each target snapshot, or of the critics
-        themselves where there is none, f32[K or 1, C, B, n]; the critics' running statistics f32[C, S] that follow.
+        The critics' outputs f32[C, B, n] on (s, a); those on (s′, a′) of the chosen critics in each target snapshot, or
+        of the critics themselves where there is none, f32[K or 1, M, B, n]; the critics' running statistics f32[C, S]
+        that follow.
     """
     now = jnp.concatenate([batch.observation, batch.action], axis=1)  # in one array: no gradient of the action is due
     then = jnp.concatenate([batch.next_observation, next_action], axis=1)
@@ -179,17 +202,19 @@ def forward(
     def train(critic: jax.Array, inputs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         return parts.q_network.train(critic, inputs, key=key)
 
-    count = parts.settings.critics
     passes: Passes = jax.vmap(train, in_axes=(0, None, 0))  # each network draws its own
     of_targets: Passes = jax.vmap(passes, in_axes=(0, None, 0))
-    own_keys, target_keys = jax.random.split(key, count), split_for(key, max(1, len(targets)), count)
+    own_keys, target_keys = jax.random.split(key, len(critic)), split_for(key, max(1, len(targets)), targets.shape[1])
     if not parts.settings.joint_forward:
         outputs, statistics = passes(critic, now, own_keys)
-        next_outputs, _ = of_targets(targets if len(targets) else critic[None], then, target_keys)
+        next_outputs, _ = of_targets(targets if len(targets) else critic[None, chosen], then, target_keys)
         return outputs, next_outputs, statistics
     both, size = jnp.concatenate([now, then]), len(now)
     outputs, statistics = passes(critic, both, own_keys)
-    next_outputs = of_targets(targets, both, target_keys)[0][..., size:, :] if len(targets) else outputs[None, :, size:]
+    if len(targets):
+        next_outputs = of_targets(targets, both, target_keys)[0][..., size:, :]
+    else:
+        next_outputs = outputs[None, chosen, size:]
     return outputs[:, :size], next_outputs, statistics
 
 
@@ -206,6 +231,7 @@ def update_actor(
     _, key = jax.random.split(key)
     alpha = jnp.exp(state.temperature.weights)
     noise = parts.noise(batch.observation, key)
+    critics_key = jax.random.fold_in(key, FOR_CRITICS)
     joint = parts.settings.actor_joint_forward
     seen = jnp.concatenate([batch.observation, batch.next_observation]) if joint else batch.observation
 
@@ -213,7 +239,7 @@ def update_actor(
         action, log_prob, statistics = parts.policy.train_sample(
             actor, seen, noise, jax.random.fold_in(key, FOR_NETWORKS)
         )
-        q = parts.q(parts.q_outputs(state.critic.weights, batch.observation, action))
+        q = parts.q(parts.q_outputs(state.critic.weights, batch.observation, action, critics_key))
         loss = actor_loss(log_prob, reduced_q(parts.settings.actor_reduction, q), alpha)
         return loss, (statistics, {"actor_loss": loss, "entropy": -jnp.mean(log_prob)})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from saclab.algorithm.networks import NETWORKS
+from saclab.algorithm.networks import policy_network
 from saclab.algorithm.networks.network import Array, Network
 from saclab.settings import AlgorithmSettings
 
@@ -66,7 +66,5 @@ def squash(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
 
 def make_policy(settings: AlgorithmSettings, observation_size: int, action_size: int) -> Policy:
     """The policy for observations f32[..., observation_size] and actions f32[..., action_size]."""
-    network = NETWORKS[settings.network](
-        observation_size, settings.hidden_layers, 2 * action_size, settings.activation, settings.weight_projection
-    )
+    network = policy_network(settings, observation_size, 2 * action_size)
     return Policy(network, settings.log_std_minimum, settings.log_std_maximum)

@@ -6,12 +6,14 @@ K = 1 is plain SAC and takes the same path.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from saclab.algorithm.networks.network import Array
+from saclab.settings import AlgorithmSettings
 
 Step = jax.Array | np.int32
 Reduction = Callable[[Array, Array], Array]
@@ -38,6 +40,25 @@ REDUCTIONS: dict[str, Reduction] = {"minimum": minimum, "mean": mean}
 """Name -> (predictions f32[C, B, n], their Q f32[C, B]) -> f32[B, n], NumPy or JAX."""
 
 
+def truncated(quantiles: Array, q: Array, dropped: int) -> Array:
+    """The quantiles f32[C, B, n] of all critics in order, without the `dropped` · C largest: f32[B, C·(n − dropped)].
+
+    Of "Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile Critics" (Kuznetsov
+    et al. 2020).
+    """
+    critics, rows, count = quantiles.shape
+    pooled = jnp.sort(jnp.moveaxis(quantiles, 0, 1).reshape(rows, critics * count), axis=1)
+    return pooled[:, : critics * (count - dropped)]
+
+
+TARGET_REDUCTIONS: dict[str, Callable[[AlgorithmSettings], Reduction]] = {
+    "minimum": lambda settings: minimum,
+    "mean": lambda settings: mean,
+    "truncated": lambda settings: partial(truncated, dropped=settings.dropped_quantiles),
+}
+"""Name -> settings -> how the target reduces the critics; what a reduction gives may have another n."""
+
+
 def averaged_prediction(
     predictions: jax.Array, to_q: Callable[[jax.Array], jax.Array], reduce: Reduction
 ) -> tuple[jax.Array, jax.Array]:
@@ -46,7 +67,7 @@ def averaged_prediction(
     Args:
         predictions: f32[K, C, B, n], each snapshot's critics on the same next states and actions.
         to_q: prediction f32[..., n] -> Q f32[...].
-        reduce: one of REDUCTIONS.
+        reduce: of REDUCTIONS or TARGET_REDUCTIONS.
 
     Returns:
         The prediction f32[B, n], and the mean over the batch of the standard deviation between the snapshots' Q f32[].

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, orthogonal, project_kernels, split
+from saclab.algorithm.networks.network import ACTIVATIONS, Array, Design, Network, orthogonal, project_kernels, split
 
 MOMENTUM = 0.99
 EPSILON = 1e-3
@@ -65,14 +65,12 @@ class Shape(NamedTuple):
         return Layers(kernels, parts[count], pairs[:count], pairs[count:])
 
 
-def batch_norm_mlp(
-    inputs: int, hidden_layers: tuple[int, ...], outputs: int, activation: str, projection: str = "none"
-) -> Network:
+def batch_norm_mlp(inputs: int, hidden_layers: tuple[int, ...], outputs: int, design: Design) -> Network:
     """Kernels start orthogonal (gain √2, that of the last layer 1), biases at 0, scales at 1."""
-    shape = Shape((inputs, *hidden_layers, outputs), activation)
+    shape = Shape((inputs, *hidden_layers, outputs), design.activation)
 
     def project(vector: jax.Array) -> jax.Array:
-        return project_kernels(vector, shape.packed, dict(enumerate(shape.kernels)), projection)
+        return project_kernels(vector, shape.packed, dict(enumerate(shape.kernels)), design.projection)
 
     return Network(
         init=lambda key: project(initial(shape, key)),

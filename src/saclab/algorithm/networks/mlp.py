@@ -6,25 +6,29 @@ from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from saclab.algorithm.networks.network import ACTIVATIONS, Array, Network, product, project_kernels, split
+from saclab.algorithm.networks.network import (
+    ACTIVATIONS,
+    INITIALISATIONS,
+    Array,
+    Design,
+    Network,
+    product,
+    project_kernels,
+    split,
+)
 
 
-def mlp(
-    inputs: int, hidden_layers: tuple[int, ...], outputs: int, activation: str, projection: str = "none"
-) -> Network:
-    """Weights and biases start uniform in ±1/√inputs of the layer, as PyTorch's do."""
+def mlp(inputs: int, hidden_layers: tuple[int, ...], outputs: int, design: Design) -> Network:
+    """[Dense -> non-linearity] per hidden layer -> Dense."""
     layers = list(pairwise((inputs, *hidden_layers, outputs)))
     sizes = tuple(part for fan_in, fan_out in layers for part in (fan_in * fan_out, fan_out))
-    nonlinearity = ACTIVATIONS[activation]
+    nonlinearity = ACTIVATIONS[design.activation]
+    initial = INITIALISATIONS[design.initialisation]
 
     def init(key: jax.Array) -> jax.Array:
-        parts = []
-        for layer_key, (fan_in, fan_out) in zip(jax.random.split(key, len(layers)), layers, strict=True):
-            bound = 1 / np.sqrt(fan_in)
-            parts.append(jax.random.uniform(layer_key, ((fan_in + 1) * fan_out,), minval=-bound, maxval=bound))
-        return project(jnp.concatenate(parts))
+        keys = jax.random.split(key, len(layers))
+        return project(jnp.concatenate([initial(own, *shape) for own, shape in zip(keys, layers, strict=True)]))
 
     def apply(vector: Array, *inputs: Array) -> Array:
         parts = iter(split(vector, sizes))
@@ -38,6 +42,6 @@ def mlp(
 
     def project(vector: jax.Array) -> jax.Array:
         kernels = {2 * number: shape for number, shape in enumerate(layers)}
-        return project_kernels(vector, sizes, kernels, projection)
+        return project_kernels(vector, sizes, kernels, design.projection)
 
     return Network(init, apply, train, project, sum(sizes))

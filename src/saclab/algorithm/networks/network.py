@@ -7,6 +7,7 @@ as well as JAX arrays (the array API standard), so a policy acts on the CPU with
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import reduce
 from itertools import accumulate
@@ -47,6 +48,19 @@ class Network(NamedTuple):
         return vector.at[..., self.size - self.statistics :].set(statistics)
 
 
+class Design(NamedTuple):
+    """How a network is built, whatever its sizes."""
+
+    activation: str = "relu"
+    """A key of ACTIVATIONS."""
+    projection: str = "none"
+    """A key of PROJECTIONS: what is done to each kernel after a step."""
+    initialisation: str = "network"
+    """A key of INITIALISATIONS: how a dense layer starts, where the network leaves it open."""
+    dropout: float = 0.0
+    """Share of the hidden units that are left out while the network learns."""
+
+
 def relu(x: Array) -> Array:
     return x.__array_namespace__().where(x > 0, x, 0)
 
@@ -74,6 +88,25 @@ def tanh(x: Array) -> Array:
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "relu": relu, "tanh": tanh, "elu": elu, "silu": silu, "gelu": gelu,
 }  # fmt: skip
+
+
+def uniform_layer(key: jax.Array, inputs: int, outputs: int) -> jax.Array:
+    """Weights and biases uniform in ±1/√inputs, as PyTorch's are; one vector f32[(I + 1)·O]."""
+    bound = 1 / math.sqrt(inputs)
+    return jax.random.uniform(key, ((inputs + 1) * outputs,), minval=-bound, maxval=bound)
+
+
+def xavier_layer(key: jax.Array, inputs: int, outputs: int) -> jax.Array:
+    """Weights uniform in ±√(6/(inputs + outputs)) (Glorot and Bengio 2010), biases 0; one vector f32[(I + 1)·O]."""
+    bound = math.sqrt(6 / (inputs + outputs))
+    weights = jax.random.uniform(key, (inputs * outputs,), minval=-bound, maxval=bound)
+    return jnp.concatenate([weights, jnp.zeros(outputs)])
+
+
+INITIALISATIONS: dict[str, Callable[[jax.Array, int, int], jax.Array]] = {
+    "network": uniform_layer,
+    "xavier": xavier_layer,
+}
 
 
 def product(inputs: tuple[Array, ...], weights: Array) -> Array:
@@ -128,7 +161,7 @@ def orthogonal(key: jax.Array, shape: tuple[int, int], gain: float = 1.0) -> jax
     """f32[I, O] with orthonormal rows or columns, times `gain` (Saxe et al. 2014)."""
     q, r = factorised(jax.random.normal(key, (max(shape), min(shape))))
     q = q * jnp.sign(jnp.diagonal(r))
-    kernel: jax.Array = gain * (q if shape[0] >= shape[1] else q.T)
+    kernel: jax.Array = gain * (q if shape[0] > shape[1] else q.T)
     return kernel
 
 

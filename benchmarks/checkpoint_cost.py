@@ -38,7 +38,7 @@ def save(engine: LocalEngine, folder: Path) -> tuple[float, int, int]:
     """Seconds, bytes of the checkpoint, and those of them that were written and not linked."""
     began = time.perf_counter()
     content = to_checkpoint(engine.snapshot(0), engine.capture_environments(0))
-    path = save_checkpoint(folder, engine.run.counters.steps, content, engine.replay)
+    path = save_checkpoint(folder, engine.run.moment(), content, engine.replay)
     seconds = time.perf_counter() - began
     return seconds, size(path), written[0]
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
+from collections.abc import Mapping
 from importlib.metadata import entry_points, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 PACKAGES = ("saclab", "jax", "jaxlib", "numpy", "optax", "gymnasium", "mujoco")
+SIMULATION_PACKAGES = ("gymnasium", "mujoco")
+"""Runs whose major versions of these differ are not comparable."""
 COMPILER_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 """What XLA is told for each program on a CPU: no fusions by YNNPACK, which jaxlib 0.10.2 and later can compile into
 wrong products or crashes (github.com/jax-ml/jax, issues 39103, 39257)."""
@@ -112,6 +116,22 @@ def processor_entry(name: str) -> str:
     information = Path("/proc/cpuinfo")
     lines = information.read_text(errors="replace").splitlines() if information.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith(name)), "")
+
+
+def major(version: str | None) -> str:
+    return re.split(r"[.+]", version)[0] if version else "unknown"
+
+
+def other_simulation(saved: Mapping[str, str], current: Mapping[str, str]) -> str | None:
+    """Why a run of these versions cannot go on with the current ones: it would be half of one task, half of another."""
+    for package in SIMULATION_PACKAGES:
+        then, now = saved.get(package), current[package]
+        if then is not None and major(then) != major(now):
+            return (
+                f"{package} was {then} when the checkpoint was made and is {now} now, another simulation: go on with "
+                f"pip install '{package}=={then}', or train anew under another name (--name)"
+            )
+    return None
 
 
 def different_facts(saved: object, current: dict[str, Any]) -> list[str]:

@@ -92,6 +92,7 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
     policy, description = load_policy(run), read_description(run)
     run, given, video = absolute(run), video, absolute(video)
     require_import_allowed(description.environment, imports)
+    require_place(video)
     with tracebacks_in([run]):
         environment = filmed_environment(description.environment, description.environment_arguments, size)
         try:
@@ -104,6 +105,20 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
     return f"{given}: {filmed} steps, return {total_reward:.1f} until then"
 
 
+def require_place(video: Path) -> None:
+    """Raise UserError unless a film can be written there: what writes it would only break off."""
+    try:
+        video.parent.mkdir(parents=True, exist_ok=True)
+        partial_of(video).touch()
+        partial_of(video).unlink()
+    except OSError as error:
+        raise UserError(f"video = {str(video)!r}: {error.strerror or error}; name another file with --video") from error
+
+
+def partial_of(video: Path) -> Path:
+    return video.with_name(video.stem + ".partial" + video.suffix)
+
+
 def film_to(
     video: Path, environment: CheckedEnvironment, policy: TrainedPolicy, steps: int, seed: int
 ) -> tuple[float, int]:
@@ -111,8 +126,7 @@ def film_to(
     import imageio.v2 as imageio
 
     frames_per_second = environment.environment.metadata.get("render_fps", 30)
-    video.parent.mkdir(parents=True, exist_ok=True)
-    partial = video.with_name(video.stem + ".partial" + video.suffix)
+    partial = partial_of(video)
     try:
         with imageio.get_writer(partial, fps=frames_per_second, macro_block_size=2, quality=6) as writer:
             filmed = film(environment, policy, writer, steps, seed)

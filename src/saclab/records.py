@@ -201,6 +201,17 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
         raise Unreadable(path, error.strerror or error, LET_READ) from error
 
 
+def is_there(path: Path) -> bool:
+    """Whether there is such a file or folder; raises Unreadable where the system does not let that be seen."""
+    try:
+        os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return False
+    except OSError as error:
+        raise Unreadable(path, error.strerror or error, LET_READ) from error
+    return True
+
+
 def from_json(path: Path, content: bytes, schema: type[Record]) -> Record:
     """The JSON of a file; raises Damaged with the place that does not fit."""
     try:

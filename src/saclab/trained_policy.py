@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from saclab.config import Config, from_plain
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.files import replace_file, write_json
-from saclab.records import UNREADABLE, Damaged, PolicyDescription, read_bytes, read_json
+from saclab.records import UNREADABLE, Damaged, PolicyDescription, is_there, read_bytes, read_json
 from saclab.settings import AlgorithmSettings
 
 ACTION_TYPES = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
@@ -99,7 +98,11 @@ def checksum(arrays: dict[str, np.ndarray], description: PolicyDescription) -> n
 
 def policy_folder(run: Path) -> Path:
     """Where the policy of a run lies: `best` in a run folder, or the folder itself."""
-    return run / "best" if os.path.isdir(run / "best") else run
+    return run / "best" if is_folder(run / "best") else run
+
+
+def is_folder(path: Path) -> bool:
+    return is_there(path) and path.is_dir()
 
 
 def read_description(run: Path) -> PolicyDescription:
@@ -118,9 +121,9 @@ def load_policy(run: Path | str) -> TrainedPolicy:
         UserError: if there is none, or its files are damaged.
     """
     folder = policy_folder(Path(run))
-    if not os.path.isdir(folder):
+    if not is_folder(folder):
         raise UserError(f"there is no folder {run}: give that of a run, or its best policy's")
-    if not os.path.lexists(folder / ARRAYS):
+    if not is_there(folder / ARRAYS):
         raise UserError(f"{run} holds no policy yet: the first is kept after the run's first evaluation")
     description = read_description(folder)
     try:

@@ -60,8 +60,8 @@ def at_step(step: int, happens: Callable[[DeviceEngine], None]) -> Iterator[None
     """Let something happen when the group has done exactly so many steps."""
     real = DeviceEngine.step
 
-    def step_and_more(engine: DeviceEngine) -> object:
-        result = real(engine)
+    def step_and_more(engine: DeviceEngine, *arguments: object) -> object:
+        result = real(engine, *arguments)
         if engine.steps == step:
             happens(engine)
         return result

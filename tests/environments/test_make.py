@@ -89,6 +89,7 @@ def test_a_dm_control_that_does_not_know_mujoco_4_is_told_apart(tmp_path, monkey
         "gymnasium.register('Suite-v0', lambda render_mode=None: dm_control.index.read(object()))\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(make, "version", lambda package: "4.0.0")
     with pytest.raises(UserError, match=r"'flex_vertedge'; this dm_control needs MuJoCo 3: pip install 'mujoco<4'"):
         make_environment("somebodys_suite:Suite-v0")
     monkeypatch.setattr(make, "version", lambda package: "3.17.0")

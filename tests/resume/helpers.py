@@ -55,8 +55,8 @@ def request_at(step: int, requests: Requests, what: str) -> Iterator[None]:
     """Let the request come when the run has done exactly so many steps, as no signal could."""
     real = LocalEngine.step
 
-    def step_and_ask(engine: LocalEngine) -> StepResult:
-        result = real(engine)
+    def step_and_ask(engine: LocalEngine, *arguments: object) -> StepResult:
+        result = real(engine, *arguments)
         if engine.run.counters.steps == step:
             setattr(requests, what, True)
         return result

@@ -20,6 +20,7 @@ from saclab.replay import ReplayBuffer, RowLayout
 from saclab.training import checkpoint as checkpoints
 from saclab.training.checkpoint import Checkpoint, save_checkpoint
 from saclab.training.common_checkpoint import load_newest_checkpoint
+from saclab.training.manifest import Moment
 
 LAYOUT, CAPACITY = RowLayout(2, 1), 40
 CALLS = ("open", "mkdir", "rename", "replace", "link", "unlink", "rmdir", "fsync", "close", "scandir", "stat")
@@ -37,7 +38,7 @@ def buffer_at(step: int) -> ReplayBuffer:
 
 def save(folder: Path, step: int) -> None:
     learner = {".actor": np.full(3, step, np.float32)}
-    save_checkpoint(folder, step, Checkpoint({"learner": learner}, {"step": step}), buffer_at(step))
+    save_checkpoint(folder, Moment(step), Checkpoint({"learner": learner}, {"step": step}), buffer_at(step))
 
 
 def loaded_step(folder: Path) -> int | None:

@@ -190,6 +190,28 @@ def test_any_other_value_in_the_manifest_is_an_error_in_words(stage, folder, cou
     assert stage.continue_from(folder).resumed_at_step == SECOND
 
 
+WRONG_STATES = {
+    "steps": (("counters", "steps"), -1, r"Expected `int` >= 0 - at `\$\.counters\.steps`"),
+    "updates of another kind": (("counters", "updates"), 1.5, r"\$\.counters\.updates"),
+    "a length": (("environments", 1, "length"), True, r"\$\.environments\[1\]\.length"),
+    "elapsed steps": (("environments", 0, "elapsed_steps"), ["7"], r"\$\.environments\[0\]\.elapsed_steps"),
+    "another generator": (("sampling", "bit_generator"), "MT19937", r"\$\.sampling\.bit_generator"),
+    "a generator's words": (("exploration", "state", "inc"), "1", r"\$\.exploration\.state\.inc"),
+    "a generator that NumPy refuses": (("exploration", "state", "inc"), 2**128, "the generator 'exploration'"),
+    "the machine": (("facts", "machine", "threads"), [1], r"\$\.facts\.machine"),
+    "a log": (("logs", "metrics.jsonl", "sha256"), "0", r"\$\.logs\[\.\.\.\]\.sha256"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_STATES)
+def test_a_state_that_does_not_fit_is_named_with_its_place(stage, folder, what):
+    path, value, words = WRONG_STATES[what]
+    manifest = json.loads((newest(folder) / "manifest.json").read_text())
+    sign(newest(folder), with_entry(manifest, ("state", *path), value))
+    with pytest.raises(CheckpointError, match=f"cannot continue .*{words}.*remove .*checkpoints"):
+        stage.continue_from(folder)
+
+
 def test_any_other_value_in_the_configuration_is_read_or_refused(folder):
     """Read as it stands, or refused with an error in words: never a traceback. Checkpoints know what it was."""
     path = folder / "config.json"

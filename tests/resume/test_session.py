@@ -71,7 +71,7 @@ def pretend(folder: Path, part: str, **facts: object) -> None:
     sign(newest(folder), manifest)
 
 
-@pytest.mark.parametrize("name", ["jax", "jaxlib", "mujoco", "saclab", "numpy", "gymnasium", "optax", "python"])
+@pytest.mark.parametrize("name", ["jax", "jaxlib", "saclab", "numpy", "optax", "python"])
 def test_another_version_is_told_and_recorded(stage, folder, name):
     pretend(folder, "versions", **{name: "0.0.1"})
     started = stage.continue_from(folder)
@@ -81,6 +81,18 @@ def test_another_version_is_told_and_recorded(stage, folder, name):
     assert f"{name} was 0.0.1 when the checkpoint was made and is {machine_facts()['versions'][name]} now" in notes[0]
     assert "results may differ in the last bits" in notes[0]
     assert lines_of(folder / "sessions.jsonl")[-1]["notes"] == list(notes)
+
+
+@pytest.mark.parametrize("name", ["mujoco", "gymnasium"])
+def test_a_run_does_not_go_on_in_another_simulation(stage, folder, name):
+    """It would be half of one task and half of another; a smaller step in the version is told as any other."""
+    now = machine_facts()["versions"][name]
+    same = now.partition(".")[0] + ".999"
+    pretend(folder, "versions", **{name: same})
+    assert f"{name} was {same}" in stage.continue_from(folder).notes[1]
+    pretend(folder, "versions", **{name: "0.9.1"})
+    with pytest.raises(UserError, match=rf"{name} was 0\.9\.1 .* is {now} now, .*pip install '{name}==0\.9\.1', or"):
+        stage.continue_from(folder)
 
 
 @pytest.mark.parametrize(

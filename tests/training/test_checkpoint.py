@@ -19,6 +19,7 @@ from saclab.training.checkpoint import (
     save_checkpoint,
 )
 from saclab.training.common_checkpoint import load_newest_checkpoint
+from saclab.training.manifest import Moment
 
 LAYOUT = RowLayout(2, 1)
 CAPACITY = 50  # not a multiple of the segments' length
@@ -41,7 +42,7 @@ def content(step: int) -> Checkpoint:
 
 
 def save(folder, step: int, replay: ReplayBuffer):
-    return save_checkpoint(folder, step, content(step), replay)
+    return save_checkpoint(folder, Moment(step), content(step), replay)
 
 
 def load(folder) -> tuple[Checkpoint | None, ReplayBuffer, list[str]]:

@@ -10,15 +10,18 @@ import pytest
 from saclab.replay import ReplayBuffer, RowLayout
 from saclab.training.checkpoint import Checkpoint, CheckpointError, newest_first, read_checkpoint, save_checkpoint
 from saclab.training.common_checkpoint import load_newest_checkpoint, read_common
+from saclab.training.manifest import Moment, moment_named
 
 LAYOUT = RowLayout(2, 1)
 
 
-def save(folder: Path, step: int, evaluate_first: bool = False) -> Path:
+def save(folder: Path, step: int, evaluate_first: bool = False, updates: int | None = None) -> Path:
+    """With `updates`, of a moment within the round of this step."""
+    moment = Moment(step, tested=not evaluate_first) if updates is None else Moment(step, False, updates)
     replay = ReplayBuffer(10, LAYOUT)
     replay.added = step
     content = Checkpoint({"learner": {".step": np.array(step)}}, {"step": step, "evaluated": not evaluate_first})
-    return save_checkpoint(folder, step, content, replay, evaluate_first)
+    return save_checkpoint(folder, moment, content, replay)
 
 
 def damage(checkpoint: Path) -> None:
@@ -86,6 +89,20 @@ def test_before_and_after_an_evaluation_is_the_same_step(runs):
     save(runs[1], 8)
     states, *_ = read_together(*runs)
     assert states == [{"step": 8, "evaluated": False}, {"step": 8, "evaluated": True}]
+
+
+def test_moments_of_a_round_lie_before_its_end(runs):
+    """As their names have it; runs that were stopped at the same update of a round are equally far."""
+    within = [Moment(8, False, 120), Moment(8, False, 121)]
+    moments = [Moment(7), *within, Moment(8, tested=False), Moment(8), Moment(9, False, 140)]
+    assert sorted(moments) == moments
+    assert [moment_named(moment.name) for moment in moments] == moments
+    assert within[1].name == "step-000000000008-update-000000000121"
+    for folder, updates in zip(runs, ((120, 121), (119, 120)), strict=True):
+        for made in updates:
+            save(folder, 8, updates=made)
+    _, _, looked_at = read_together(*runs)
+    assert looked_at == [Moment(8, False, 120).name] * 2
 
 
 @pytest.mark.parametrize("together", [False, True])

@@ -11,7 +11,8 @@ from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError
 from saclab.protocols import make_config
 from saclab.training.evaluation import EvaluationEpisodes
-from saclab.training.run_state import Counters, RunState
+from saclab.training.run_state import RunState
+from saclab.training.saved_state import Counters
 
 
 @pytest.fixture

@@ -16,12 +16,15 @@ from saclab.batch.replay import DeviceReplay
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import RunBroken
 from saclab.replay import draw
-from saclab.training.engine import NOTHING_HAPPENED, Broken, StepResult
+from saclab.training.engine import NOTHING_HAPPENED, Broken, StepResult, never
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.learners import numbers_of, reward_weights
 from saclab.training.q_bias import QBias
 from saclab.training.run_state import RunState
 from saclab.training.snapshot import EnvironmentStates, Snapshot, Start
+
+LONGEST_CALL, SHORTEST_PART = 512, 8
+"""Updates of all slots together in one call, which a stop has to wait for; no call has fewer of each slot than this."""
 
 
 class Experience(NamedTuple):
@@ -53,7 +56,7 @@ class DeviceEngine:
             UserError: if a process cannot make the environment.
         """
         self.runs = [start.run for start in starts]
-        self.spec, self.program, self.replay = spec, program, replay
+        self.spec, self.program, self.replay, self.slots = spec, program, replay, program.slots
         configs = [run.config for run in self.runs]
         self.training, self.batch_size = configs[0].training, configs[0].algorithm.batch_size
         self.steps, self.updates = self.runs[0].counters.steps, self.runs[0].counters.updates
@@ -72,7 +75,7 @@ class DeviceEngine:
         self._host_actors: np.ndarray | None = None
         self.pool = restored_pool(starts, spec, workers)
 
-    def step(self) -> StepResult:
+    def step(self, should_pause: Callable[[], bool] = never) -> StepResult:
         """Take a step of every run.
 
         Raises:
@@ -86,7 +89,20 @@ class DeviceEngine:
         ended: Mapping[int, Any] = {}
         if self.pool.buffers.ended.any():
             ended = {run: self.pool.ended(run) for run in active}
+        if not broken:
+            self.make_updates(should_pause)
         return StepResult(ended, broken) if ended or broken else NOTHING_HAPPENED
+
+    def make_updates(self, should_pause: Callable[[], bool] = never) -> None:
+        """Have the devices make the updates that are left, in parts; the last one with the next step."""
+        active = [state if run in self.active else None for run, state in enumerate(self.runs)]
+        while self.updates < self.training.updates_due(self.steps):
+            self.flush()
+            jax.block_until_ready(self.undelivered[-1:])  # type: ignore[no-untyped-call]
+            if should_pause():
+                return
+            rows, position = self.replay.newest(self.steps, self.training.parallel_environments)
+            self.experience = Experience(rows[: len(active)], position[: len(active)], self._draw(active))
 
     def drop(self, run: int) -> None:
         """Go on without a run. Its slot stays: what the others compute is the same."""
@@ -109,15 +125,17 @@ class DeviceEngine:
             run: joined([reply for reply, owner in zip(replies, owners, strict=True) if owner == run]) for run in runs
         }
 
-    def measure_q_bias(self, runs: Sequence[int]) -> Mapping[int, QBias | RunBroken]:
+    def measure_q_bias(
+        self, runs: Sequence[int], should_stop: Callable[[], bool] = never
+    ) -> Mapping[int, QBias | RunBroken]:
         wanted = [run for run in runs if self.runs[run].config.training.q_bias_episodes]
         jobs = []
         for run in wanted:
             learner = self._learner(run)
-            header = {"do": "q_bias", "run": run, "evaluations": self.runs[run].counters.evaluations}
+            header = {"do": "q_bias", "run": run, "evaluation": self.runs[run].counters.evaluations + 1}
             judged = {"actor": learner.actor, "critic": learner.critic, "log_alpha": learner.temperature}
             jobs.append((header, {name: np.asarray(trained.weights) for name, trained in judged.items()}))
-        replies = self.pool.work_off(jobs, lambda: False)
+        replies = self.pool.work_off(jobs, should_stop)
         return {
             run: QBias(*reply["bias"]) if "bias" in reply else error_of(reply["failure"], {})
             for run, (reply, _) in zip(wanted, replies, strict=True)
@@ -197,8 +215,8 @@ class DeviceEngine:
         if noise is not None:
             observations = self.pool.buffers.observation.reshape(len(self.runs), -1)
             parts |= {"observation": observations, "noise": noise}
-        packed = self.program.put(self.program.inputs(updates).pack(self.program.slots, **parts))
-        if updates:
+        packed = self.program.put(self.program.inputs(updates).pack(self.slots, **parts))
+        if updates and self.updates - updates == self._round_start:
             self.actor_before = self.state.actor.weights
         delayed = self.training.acting_delay > 0
         actions = self._act(packed) if delayed and noise is not None else None
@@ -227,22 +245,32 @@ class DeviceEngine:
             self.undelivered.append(metrics)
 
     def _take_experience(self, runs: Sequence[RunState | None]) -> None:
-        """Keep the step's transitions, and draw the minibatches of the updates that are due; None draws nothing."""
+        """Keep the step's transitions, and draw the minibatches of the first updates due; None draws nothing."""
         training = self.training
-        due = training.updates_due(self.steps) - self.updates
-        self.updates += due
         rows = self.pool.buffers.row.reshape(len(runs), training.parallel_environments, -1).copy()
         before = self.steps - training.parallel_environments
         position = np.full(len(runs), before % training.replay_capacity, np.int32)
-        drawn = np.zeros((len(runs), due, self.batch_size), np.int32)
         self._scale_rewards(rows, runs)
+        self.experience = Experience(rows, position, self._draw(runs))
+
+    def _draw(self, runs: Sequence[RunState | None]) -> np.ndarray:
+        """i32[R, U, B]: rows for the next part of this round of updates; None draws nothing."""
+        first, last = self._round_start, self.training.updates_due(self.steps)
+        end = first + end_of_part(self.updates - first, last - first, max(SHORTEST_PART, LONGEST_CALL // self.slots))
+        drawn = np.zeros((len(runs), end - self.updates, self.batch_size), np.int32)
+        self.updates = end
+        stored = min(self.steps, self.training.replay_capacity)
         for place, run in enumerate(runs):
-            if run is None:
-                continue
-            run.counters.steps, run.counters.updates = self.steps, self.updates
-            for update in range(due):
-                drawn[place, update] = draw(run.sampling, min(self.steps, training.replay_capacity), self.batch_size)
-        self.experience = Experience(rows, position, drawn)
+            if run is not None:
+                run.counters.steps, run.counters.updates = self.steps, self.updates
+                for rows in drawn[place]:
+                    rows[:] = draw(run.sampling, stored, self.batch_size)
+        return drawn
+
+    @property
+    def _round_start(self) -> int:
+        """Updates that were made before the last step."""
+        return self.training.updates_due(self.steps - self.training.parallel_environments)
 
     def _scale_rewards(self, rows: np.ndarray, runs: Sequence[RunState | None]) -> None:
         """Let the running scales take in the rewards of rows f32[runs, E, width], where rewards are scaled."""
@@ -257,8 +285,18 @@ class DeviceEngine:
 
     def _put_stacked(self, trees: Sequence[Any]) -> Any:
         """One tree per run as one tree on the devices; the slots without a run are like the first one's."""
-        filled = [*trees, *[trees[0]] * (self.program.slots - len(trees))]
+        filled = [*trees, *[trees[0]] * (self.slots - len(trees))]
         return self.program.put(jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *filled))
+
+
+def end_of_part(made: int, due: int, longest: int) -> int:
+    """Updates of a round that are made when the next part of it is; the parts are of equal size, to one.
+
+    Their ends decide the last bits, so they must not depend on where a round was interrupted.
+    """
+    parts = -(-due // longest)
+    following = -(-(made + 1) * parts // due) if due else 0
+    return following * due // parts if due else 0
 
 
 def restored_pool(starts: Sequence[Start], spec: EnvironmentSpec, workers: int) -> EnvironmentPool:

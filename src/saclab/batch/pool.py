@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from saclab.batch import frames
@@ -29,6 +30,7 @@ from saclab.training import seeds
 from saclab.training.captured import join_arrays, split_arrays
 from saclab.training.engine import EnvironmentStateError
 from saclab.training.requests import Stopped
+from saclab.training.saved_state import EnvironmentState
 
 POLL_SECONDS = 0.1
 
@@ -138,7 +140,8 @@ class EnvironmentPool:
             worker.send({"do": "capture", "run": run}, {})
             reply, arrays = worker.receive()
             require_whole(reply)
-            states += join_arrays(arrays, reply["rest"], self._example(len(reply["rest"])))
+            rest = msgspec.convert(reply["rest"], list[EnvironmentState | None])
+            states += join_arrays(arrays, rest, self._example(len(rest)))
         return states
 
     def restore(self, run: int, states: list[dict[str, Any] | None], new_seeds: list[int]) -> list[int]:
@@ -152,7 +155,9 @@ class EnvironmentPool:
         for worker in self._owners(run):
             part = slice(first, first + worker.count(run))
             arrays, rest = split_arrays(states[part])
-            worker.send({"do": "restore", "run": run, "rest": rest, "seeds": new_seeds[part]}, arrays)
+            worker.send(
+                {"do": "restore", "run": run, "rest": msgspec.to_builtins(rest), "seeds": new_seeds[part]}, arrays
+            )
             reply, _ = worker.receive()
             if "misfit" in reply:
                 raise EnvironmentStateError(run, reply["misfit"])

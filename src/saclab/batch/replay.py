@@ -27,6 +27,12 @@ class DeviceReplay:
         """Put the rows f32[capacity, width] of one slot in their place; they can be used again then."""
         self.rows = set_slot(self.rows, slot, rows).block_until_ready()
 
+    def newest(self, added: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The rows f32[S, count, width] that were stored last, and the place i32[S] of their first."""
+        first = (added - count) % self.capacity
+        positions = (first + np.arange(count)) % self.capacity
+        return np.asarray(self.rows[:, positions]), np.full(len(self.rows), first, np.int32)
+
     def slot(self, slot: int, added: int) -> SlotReplay:
         """The buffer of one slot as it is now, to be read before anything else is stored."""
         return SlotReplay(SlotRows(self.rows, slot), self.layout, self.capacity, added)

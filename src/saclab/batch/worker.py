@@ -11,6 +11,7 @@ import os
 import sys
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from saclab.algorithm.learner import Learner
@@ -28,6 +29,7 @@ from saclab.training.evaluation import Evaluator
 from saclab.training.learners import learner_of
 from saclab.training.q_bias import critics_of, q_bias_at
 from saclab.training.requests import Stopped
+from saclab.training.saved_state import EnvironmentState
 
 STEP, MESSAGE, DONE = b"s", b"m", b"."
 
@@ -121,7 +123,10 @@ class EnvironmentWorker:
         config, learner = self.configs[header["run"]], self._learner(header["run"])
         critics = critics_of(config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"])
         try:
-            bias = q_bias_at(config, critics, self.evaluator.environments[0], header["evaluations"])
+            environment, stop = self.evaluator.environments[0], self.buffers.stop
+            bias = q_bias_at(config, critics, environment, header["evaluation"], lambda: bool(stop[0]))
+        except Stopped:
+            return {"stopped": True}, {}
         except Exception as error:
             return {"failure": described(error)}, {}
         return {"bias": list(bias)}, {}
@@ -132,13 +137,14 @@ class EnvironmentWorker:
             captured, rest = split_arrays(self._share(run).environments.capture())
         except Exception as error:
             return {"failure": described(error)}, {}
-        return {"rest": rest}, captured
+        return {"rest": msgspec.to_builtins(rest)}, captured
 
     def restore(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """Continue the episodes; which environments started anew instead, or why the states do not fit."""
         share = self._share(header["run"])
         try:
-            states = join_arrays(arrays, header["rest"], share.environments.observation)
+            rest = msgspec.convert(header["rest"], list[EnvironmentState | None])
+            states = join_arrays(arrays, rest, share.environments.observation)
             restarted = share.environments.restore(states, header["seeds"])
         except (KeyError, OverflowError, TypeError, ValueError) as error:
             return {"misfit": str(error)}, {}

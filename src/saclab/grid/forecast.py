@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -130,19 +130,31 @@ def measure(kind: Kind) -> Cost:
         while counters.steps < random_steps:
             step(engine)
         per_step = (time.perf_counter() - began) / counters.steps
-        while counters.updates < WARM_UPDATES:
-            step(engine)
+        go_on(engine, WARM_UPDATES)
         engine.actor(0)  # waits for the updates
         began, first = time.perf_counter(), counters.updates
-        while counters.updates < first + MEASURED_UPDATES:
-            step(engine)
+        go_on(engine, first + MEASURED_UPDATES)
         engine.actor(0)
         return Cost((time.perf_counter() - began) / (counters.updates - first), per_step)
 
 
-def step(engine: Engine) -> None:
+def go_on(engine: Engine, updates: int) -> None:
+    """Step until so many updates are made: not until the end of a round, which may have a hundred thousand."""
+    run = engine.runs[0]
+
+    def enough() -> bool:
+        return run.counters.updates >= updates
+
+    while not enough():
+        if run.updates_left > 0:
+            engine.make_updates(enough)
+        else:
+            step(engine, enough)
+
+
+def step(engine: Engine, should_pause: Callable[[], bool] = lambda: False) -> None:
     """One step; raises RunBroken if it ends a run, which would never come to its updates."""
-    for broken in engine.step().broken.values():
+    for broken in engine.step(should_pause).broken.values():
         raise broken.error
 
 

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 from saclab.config import group_key
 from saclab.grid.plan import Cell
-from saclab.training.common_checkpoint import checkpoint_steps, group_slots
+from saclab.training.common_checkpoint import checkpoint_moments, group_slots
+from saclab.training.manifest import Moment
 from saclab.training.run_folder import FAILURE
 
-NO_CHECKPOINT = -1  # in place of a step: one of step 0 is something else
+NO_CHECKPOINT = Moment(-1)  # one of step 0 is something else
 
 
 class RunGroup(NamedTuple):
@@ -36,7 +37,7 @@ def run_groups(cells: Sequence[Cell], size: int) -> list[RunGroup]:
 
 
 def by_progress(cells: Sequence[Cell], members: Sequence[int]) -> list[list[int]]:
-    """Parts that have a checkpoint of the same step, or none at all; the runs of a group are always equally far.
+    """Parts that have a checkpoint of the same moment, or none at all; the runs of a group are always equally far.
 
     A process that was killed while it saved leaves the newest checkpoint in some of its runs only; the one before
     is in all of them, as two are kept. A run that has failed would only hold up the others, or fail with them again.
@@ -44,12 +45,12 @@ def by_progress(cells: Sequence[Cell], members: Sequence[int]) -> list[list[int]
     parts = []
     for failed in (False, True):
         chosen = [index for index in members if (cells[index].folder / FAILURE).exists() == failed]
-        steps = {index: checkpoint_steps(cells[index].folder) or [NO_CHECKPOINT] for index in chosen}
-        while steps:
-            common = min(found[0] for found in steps.values())
-            part = [index for index, found in steps.items() if common in found]
+        moments = {index: checkpoint_moments(cells[index].folder) or [NO_CHECKPOINT] for index in chosen}
+        while moments:
+            common = min(found[0] for found in moments.values())
+            part = [index for index, found in moments.items() if common in found]
             parts.append(part)
-            steps = {index: found for index, found in steps.items() if index not in part}
+            moments = {index: found for index, found in moments.items() if index not in part}
     return parts
 
 

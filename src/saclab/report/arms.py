@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from saclab.config import Config
 from saclab.errors import UserError
+from saclab.machine import SIMULATION_PACKAGES, major
 from saclab.protocols import PROTOCOLS, make_config, protocol_settings, split_settings
 from saclab.report.text import shown
 from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord, safe_name
 from saclab.variants import VARIANTS
-
-SIMULATION_PACKAGES = ("gymnasium", "mujoco")
-"""Runs whose major versions of these differ are not comparable."""
 
 ONLY_MEASURING = ("q_bias_episodes",)
 """Settings that change what is measured beside the training, and not its course."""
@@ -131,10 +128,6 @@ def beside_variant(config: Config) -> dict[str, Any]:
 def is_known(config: Config) -> bool:
     """Whether this version knows which settings are the variant's own."""
     return config.variant in VARIANTS and config.protocol in PROTOCOLS
-
-
-def major(version: str | None) -> str:
-    return re.split(r"[.+]", version)[0] if version else "unknown"
 
 
 def unlike(run: RunRecord, reference: RunRecord) -> dict[str, tuple[Any, Any]]:

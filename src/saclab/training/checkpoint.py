@@ -1,6 +1,7 @@
 """Checkpoints: written whole or not at all, checksummed, never unpickled, and cheap to take often.
 
-    checkpoints/step-000000012000/                       or step-…-untested, if an evaluation comes first
+    checkpoints/step-000000012000/                       or step-…-untested, if an evaluation comes first, or
+                                                         step-…-update-…, if further updates do
       learner.safetensors, environments.safetensors, …   one file per group of arrays
       replay-0000.safetensors, …                         the replay buffer, SEGMENT_ROWS rows each
       manifest.json                                      every file's SHA-256 and size, and the plain state
@@ -36,9 +37,11 @@ from saclab.training.manifest import (
     MANIFEST,
     MANIFEST_CHECKSUM,
     CheckpointError,
+    Moment,
     newest_first,
     read_manifest,
     read_plain_file,
+    visible_checkpoints,
 )
 
 KEPT = 2
@@ -78,18 +81,13 @@ class Replay(Protocol):
     def layout(self) -> RowLayout: ...
 
 
-def save_checkpoint(
-    folder: Path, step: int, checkpoint: Checkpoint, replay: Replay, evaluate_first: bool = False
-) -> Path:
-    """Write `folder`/step-… and remove all but the newest two; an existing one of the same name stays.
-
-    With `evaluate_first` it is of the moment before the evaluation that falls into this step, and older than one of
-    the moment after it.
+def save_checkpoint(folder: Path, moment: Moment, checkpoint: Checkpoint, replay: Replay) -> Path:
+    """Write `folder`/step-… and remove all but the newest two; an existing one of the same moment stays.
 
     Raises:
         CheckpointError: if it cannot be written; what was there before is whole.
     """
-    final = folder / f"step-{step:012d}{'-untested' if evaluate_first else ''}"
+    final = folder / moment.name
     if final.exists():
         return final
     partial = final.with_suffix(".partial")
@@ -114,7 +112,7 @@ def save_checkpoint(
 
 def cannot_save(final: Path, error: OSError) -> str:
     """What happened, what is kept, and the way out."""
-    kept = newest_first(final.parent)
+    kept = visible_checkpoints(final.parent)
     reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else str(error)
     return (
         f"cannot save {final}: {reason}. "

@@ -42,6 +42,10 @@ class StepResult(NamedTuple):
 NOTHING_HAPPENED = StepResult({}, {})
 
 
+def never() -> bool:
+    return False
+
+
 class Engine(Protocol):
     """R runs that take their steps together. A run is named by its place in `runs`."""
 
@@ -49,8 +53,15 @@ class Engine(Protocol):
     def runs(self) -> Sequence[RunState]:
         """What belongs to each run on the host; the engine counts steps and updates there, the loop all else."""
 
-    def step(self) -> StepResult:
-        """Step every environment once, store the transitions, make the updates due."""
+    def step(self, should_pause: Callable[[], bool] = never) -> StepResult:
+        """Step every environment once, store the transitions, make the updates due.
+
+        Updates may be left to make, as `RunState.updates_left` says: when `should_pause`, or if a run broke. What
+        broke has to be dropped and `make_updates` called then, before the next step.
+        """
+
+    def make_updates(self, should_pause: Callable[[], bool] = never) -> None:
+        """Make the updates that are left of this round, until `should_pause`, which is asked within seconds."""
 
     def deliver_metrics(self) -> None:
         """Bring the metrics of all updates that were made into the runs' windows."""
@@ -64,10 +75,15 @@ class Engine(Protocol):
             Stopped: when `should_stop`; the runs are as before.
         """
 
-    def measure_q_bias(self, runs: Sequence[int]) -> Mapping[int, QBias | RunBroken]:
-        """How far the critics are from Monte-Carlo soft returns, as after the last evaluation, or what broke.
+    def measure_q_bias(
+        self, runs: Sequence[int], should_stop: Callable[[], bool] = never
+    ) -> Mapping[int, QBias | RunBroken]:
+        """How far the critics are from Monte-Carlo soft returns, as part of the next evaluation, or what broke.
 
         Runs that do not want it are missing.
+
+        Raises:
+            Stopped: when `should_stop`; the runs are as before.
         """
 
     def actor(self, run: int) -> np.ndarray:

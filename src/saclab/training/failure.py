@@ -14,7 +14,7 @@ from saclab.environments.watch import log
 from saclab.errors import RunBroken, TrainingFailed, UserError, for_terminal
 from saclab.files import replace_file, write_json
 from saclab.training.learners import named_leaves
-from saclab.training.manifest import newest_first
+from saclab.training.manifest import visible_checkpoints
 from saclab.training.run_folder import FAILURE
 from saclab.training.snapshot import Snapshot
 
@@ -46,7 +46,7 @@ def write_failure_report(folder: Path, snapshot: Snapshot, error: RunBroken) -> 
         left = f"What led to it lies in {failure}"
     except OSError as problem:
         left = f"What led to it could not be written to {folder} ({problem.strerror})"
-    kept = newest_first(folder / "checkpoints")
+    kept = visible_checkpoints(folder / "checkpoints")
     return left + (f"; the last checkpoint, {kept[0].name}, is kept" if kept else "")
 
 

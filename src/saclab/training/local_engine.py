@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from saclab.algorithm.types import Context
@@ -16,12 +17,15 @@ from saclab.replay import ReplayBuffer, layout_of
 from saclab.settings import structure
 from saclab.training import seeds
 from saclab.training.checkpoint import Checkpoint, read_checkpoint
-from saclab.training.engine import NOTHING_HAPPENED, Broken, EnvironmentStateError, StepResult, spec_of
+from saclab.training.engine import NOTHING_HAPPENED, Broken, EnvironmentStateError, StepResult, never, spec_of
 from saclab.training.evaluation import EvaluationEpisodes, Evaluator
 from saclab.training.learners import compiled_update, learner_of, numbers_of, on_device, reward_weights
 from saclab.training.q_bias import QBias, critics_of, q_bias_at
 from saclab.training.requests import Stopped
 from saclab.training.snapshot import EnvironmentStates, Snapshot, Start, new_start
+
+IN_FLIGHT = 2
+"""Updates that XLA is asked for at once at most: a stop has to wait for all of them; with one it would run dry."""
 
 
 class LocalBuilder:
@@ -79,7 +83,7 @@ class LocalEngine:
         builder = LocalBuilder(config)
         return builder.build([new_start(config, builder.layout)])
 
-    def step(self) -> StepResult:
+    def step(self, should_pause: Callable[[], bool] = never) -> StepResult:
         run, counters = self.run, self.run.counters
         try:
             transitions, ended = self.environments.step(self._next_action())
@@ -91,17 +95,23 @@ class LocalEngine:
             run.reward_scale.enter(transitions.reward_terms @ self.reward_weights, last)
             self.context = self.context._replace(reward_scale=run.reward_scale.value)
         counters.steps += len(self.environments)
-        updates_due = run.config.training.updates_due(counters.steps)
-        if counters.updates < updates_due:
+        if run.updates_left:
             self._actor_before = self.actor(0)
-        while counters.updates < updates_due:
+        self.make_updates(should_pause)
+        return StepResult({0: ended}, {}) if ended else NOTHING_HAPPENED
+
+    def make_updates(self, should_pause: Callable[[], bool] = never) -> None:
+        run, counters = self.run, self.run.counters
+        for _ in range(run.updates_left):
             rows = self.replay.sample(run.sampling, run.config.algorithm.batch_size)
             context = self.context._replace(step=np.int32(counters.updates))
             self.learner_state, metrics = self.update(self.numbers, self.learner_state, rows, context)
             run.window.append(metrics)
             counters.updates += 1
             self._actor = None
-        return StepResult({0: ended}, {}) if ended else NOTHING_HAPPENED
+            jax.block_until_ready(run.window[-IN_FLIGHT : 1 - IN_FLIGHT])  # type: ignore[no-untyped-call]
+            if should_pause():
+                return
 
     def _next_action(self) -> np.ndarray:
         """f32[N, A] in [-1, 1]: uniform during the random steps, then a sample of the policy."""
@@ -131,7 +141,7 @@ class LocalEngine:
         """They are in the window already."""
 
     def evaluate(
-        self, runs: Sequence[int], should_stop: Callable[[], bool] = lambda: False
+        self, runs: Sequence[int], should_stop: Callable[[], bool] = never
     ) -> Mapping[int, EvaluationEpisodes | RunBroken]:
         actor = self.actor(0)
 
@@ -146,7 +156,9 @@ class LocalEngine:
         except RunBroken as error:
             return {0: error}
 
-    def measure_q_bias(self, runs: Sequence[int]) -> Mapping[int, QBias | RunBroken]:
+    def measure_q_bias(
+        self, runs: Sequence[int], should_stop: Callable[[], bool] = never
+    ) -> Mapping[int, QBias | RunBroken]:
         config, state = self.run.config, self.learner_state
         if config.training.q_bias_episodes == 0:
             return {}
@@ -154,7 +166,8 @@ class LocalEngine:
             config, self.learner, self.actor(0), np.array(state.critic.weights), np.asarray(state.temperature.weights)
         )
         try:
-            return {0: q_bias_at(config, critics, self.evaluator.environments[0], self.run.counters.evaluations)}
+            environment, number = self.evaluator.environments[0], self.run.counters.evaluations + 1
+            return {0: q_bias_at(config, critics, environment, number, should_stop)}
         except RunBroken as error:
             return {0: error}
 

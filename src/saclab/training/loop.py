@@ -12,7 +12,7 @@ from saclab.errors import NonFiniteError, RunBroken, TrainingFailed
 from saclab.files import absolute
 from saclab.limits import require_minutes
 from saclab.machine import machine_facts
-from saclab.training.engine import Engine, EngineBuilder
+from saclab.training.engine import NOTHING_HAPPENED, Engine, EngineBuilder
 from saclab.training.events import Event, Failed, Interrupted, Started
 from saclab.training.failure import tell_of_closing, tracebacks_in, write_failure_report
 from saclab.training.local_engine import LocalBuilder
@@ -133,36 +133,63 @@ class Session:
         runs = self.engine.runs
         while True:
             try:
-                if due := [run for run in self.active if runs[run].evaluation_due()]:
+                if not self._in_round() and (due := [run for run in self.active if runs[run].evaluation_due()]):
                     yield from self._evaluate(due)
                 if self.requests.stop:
                     yield from self._stop()
                     return
                 # before a save that comes by the clock: the last checkpoint is the one after the last evaluation
-                if ending := {run: reason for run in self.active if (reason := runs[run].finish_reason())}:
+                if not self._in_round() and (ending := self._ending()):
                     yield from self._finish(ending)
             except Stopped:
                 yield from self._stop()
                 return
             if not self.active:
                 return
-            now = time.monotonic()
-            if self.requests.save or now - self.last_save > self.checkpoint_seconds:
+            if self._save_is_due():
                 yield from self._save()
-            if now - self.last_progress > PROGRESS_SECONDS:
-                self.last_progress = now
+            if self._progress_is_due():
+                self.last_progress = time.monotonic()
                 for run in self.active:
                     yield run, self.writers[run].progress()
             yield from self._step()
 
+    def _save_is_due(self) -> bool:
+        return self.requests.save or time.monotonic() - self.last_save > self.checkpoint_seconds
+
+    def _progress_is_due(self) -> bool:
+        return time.monotonic() - self.last_progress > PROGRESS_SECONDS
+
+    def _asked_to_stop(self) -> bool:
+        return self.requests.stop != 0
+
+    def _should_pause(self) -> bool:
+        """Whether there is something to do within a round of updates, which may take hours."""
+        return self._asked_to_stop() or self._save_is_due() or self._progress_is_due()
+
+    def _in_round(self) -> bool:
+        """Whether updates are left to make before the next step; the runs of an engine are equally far."""
+        return any(self.engine.runs[run].updates_left > 0 for run in self.active)
+
+    def _ending(self) -> dict[int, str]:
+        """The runs that are at their end, with the reason."""
+        return {run: reason for run in self.active if (reason := self.engine.runs[run].finish_reason())}
+
     def _step(self) -> Told:
-        result = self.engine.step()
+        """A step with its round of updates, or the rest of a round."""
+        if self._in_round():
+            self.engine.make_updates(self._should_pause)
+            result = NOTHING_HAPPENED
+        else:
+            result = self.engine.step(self._should_pause)
         for run, (error, snapshot) in result.broken.items():
             yield self._fail(run, error, snapshot)
         for run, episodes in result.ended.items():
             for episode in episodes:
                 for event in self.writers[run].log_episode(episode):
                     yield run, event
+        if self._in_round():
+            return
         for run in tuple(self.active):
             state = self.engine.runs[run]
             if state.window_size >= state.config.training.log_interval:
@@ -196,25 +223,21 @@ class Session:
         Raises:
             Stopped: on a request to stop; each of them is as before then, and will be evaluated first.
         """
-        engine, evaluated = self.engine, {}
+        engine = self.engine
         try:
-            found = engine.evaluate(runs, lambda: self.requests.stop != 0)
+            found = engine.evaluate(runs, self._asked_to_stop)
+            whole = [run for run in runs if not isinstance(found[run], RunBroken)]
+            biases = engine.measure_q_bias(whole, self._asked_to_stop)
         except Stopped:
             for run in runs:
                 engine.runs[run].postpone_evaluation()
             raise
         for run in runs:
-            match found[run]:
-                case RunBroken() as error:
+            match found[run], biases.get(run):
+                case (RunBroken() as error, _) | (_, RunBroken() as error):
                     yield self._fail(run, error, engine.snapshot(run))
-                case episodes:
-                    evaluated[run] = episodes, engine.runs[run].enter_evaluation(episodes, engine.actor(run))
-        biases = engine.measure_q_bias(list(evaluated))
-        for run, (episodes, best) in evaluated.items():
-            match biases.get(run):
-                case RunBroken() as error:
-                    yield self._fail(run, error, engine.snapshot(run))
-                case bias:
+                case episodes, bias:
+                    best = engine.runs[run].enter_evaluation(episodes, engine.actor(run))
                     yield run, self.writers[run].log_evaluation(episodes, best, bias)
 
     def _finish(self, reasons: dict[int, str]) -> Told:

@@ -3,31 +3,79 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from saclab.errors import TrainingFailed
-from saclab.records import JSON_BYTES, Damaged, Formatted, Manifest, from_json, read_bytes
+from saclab.records import JSON_BYTES, Damaged, Formatted, Manifest, Unreadable, from_json, read_bytes
 
 FORMAT, OLDEST_FORMAT = 3, 1
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
 SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
-CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(-untested)?")
+CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(?:-update-(\d{12,})|(-untested))?")
 
 
 class CheckpointError(TrainingFailed):
     """A checkpoint could not be written, or none that is whole could be read."""
 
 
-def step_of(checkpoint: Path) -> int:
-    return int(checkpoint.name.split("-")[1])
+class Moment(NamedTuple):
+    """When a checkpoint was taken; a later moment is a larger one."""
+
+    steps: int
+    round_is_whole: bool = True
+    """Whether all updates were made that this many steps make due."""
+    updates: int = 0
+    """Updates made, where more are due; else 0."""
+    tested: bool = True
+    """Whether the evaluation that falls into this step, if any, has been made."""
+
+    @property
+    def name(self) -> str:
+        """The name of the checkpoint's folder."""
+        if not self.round_is_whole:
+            return f"step-{self.steps:012d}-update-{self.updates:012d}"
+        return f"step-{self.steps:012d}" + ("" if self.tested else "-untested")
+
+
+def moment_named(name: str) -> Moment | None:
+    """The moment of the checkpoint whose folder has this name; None if it is none's."""
+    if (match := CHECKPOINT_NAME.fullmatch(name)) is None:
+        return None
+    steps, updates, untested = match.groups()
+    return Moment(int(steps), updates is None, int(updates or 0), untested is None)
+
+
+def moment_of(checkpoint: Path) -> Moment:
+    """The moment of a finished checkpoint."""
+    moment = moment_named(checkpoint.name)
+    assert moment is not None
+    return moment
 
 
 def newest_first(folder: Path) -> list[Path]:
-    """The finished checkpoints."""
-    found = [(match, path) for path in folder.glob("step-*") if (match := CHECKPOINT_NAME.fullmatch(path.name))]
-    found.sort(key=lambda pair: (int(pair[0][1]), pair[0][2] is None), reverse=True)
-    return [path for _, path in found]
+    """The finished checkpoints; none if there is no such folder.
+
+    Raises:
+        Unreadable: if it cannot be looked into. A run whose checkpoints were hidden must not begin anew.
+    """
+    try:
+        names = os.listdir(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise Unreadable(folder, error.strerror or error, "let this process read it") from error
+    return sorted((folder / name for name in names if moment_named(name)), key=moment_of, reverse=True)
+
+
+def visible_checkpoints(folder: Path) -> list[Path]:
+    """The same, for those who only look around; none where nothing can be seen."""
+    with suppress(Unreadable):
+        return newest_first(folder)
+    return []
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -22,6 +22,7 @@ from saclab.config import Config
 from saclab.environments.checked import CheckedEnvironment
 from saclab.errors import NonFiniteError
 from saclab.training import seeds
+from saclab.training.requests import Stopped
 
 NEGLIGIBLE = 0.01  # weight γ^n below which what follows a cut-off state is left out
 
@@ -86,12 +87,14 @@ def critics_of(
     )  # fmt: skip
 
 
-def q_bias_at(config: Config, critics: Critics, environment: CheckedEnvironment, evaluation: int) -> QBias:
-    """The bias after a run's evaluation number `evaluation`, which says what is drawn."""
+def q_bias_at(
+    config: Config, critics: Critics, environment: CheckedEnvironment, evaluation: int, should_stop: Callable[[], bool]
+) -> QBias:
+    """The bias at a run's evaluation number `evaluation`, which says what is drawn; raises Stopped if `should_stop`."""
     return measure_q_bias(
         critics, environment,
         seeds.integers(config.seed, "q_bias", config.training.q_bias_episodes, evaluation),
-        seeds.generator(config.seed, "q_bias", evaluation),
+        seeds.generator(config.seed, "q_bias", evaluation), should_stop,
     )  # fmt: skip
 
 
@@ -100,9 +103,15 @@ def measure_q_bias(
     environment: CheckedEnvironment,
     episode_seeds: Sequence[int],
     generator: np.random.Generator,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> QBias:
-    """Play one episode per seed with the stochastic policy, and compare."""
-    episodes = [play(critics, environment, seed, generator) for seed in episode_seeds]
+    """Play one episode per seed with the stochastic policy, and compare.
+
+    Raises:
+        NonFiniteError: if the environment gives an observation or a reward that is not finite.
+        Stopped: when `should_stop`.
+    """
+    episodes = [play(critics, environment, seed, generator, should_stop) for seed in episode_seeds]
     known = [known_returns(episode, critics.alpha, critics.discount) for episode in episodes]
     returns = np.concatenate(known)
     q = np.concatenate([
@@ -116,12 +125,20 @@ def measure_q_bias(
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused at the end
-def play(critics: Critics, environment: CheckedEnvironment, seed: int, generator: np.random.Generator) -> Episode:
+def play(
+    critics: Critics,
+    environment: CheckedEnvironment,
+    seed: int,
+    generator: np.random.Generator,
+    should_stop: Callable[[], bool],
+) -> Episode:
     """One episode of the stochastic policy."""
     observation, spec = environment.reset(seed), environment.spec
     rows: list[tuple[np.ndarray, np.ndarray, float, float]] = []
     act: Callable[..., tuple[np.ndarray, np.ndarray]] = critics.policy.sample
     while True:
+        if should_stop():
+            raise Stopped
         seen = np.array(observation, np.float32)[None]  # the environment may write over its own
         noise = generator.standard_normal((1, spec.action_size), np.float32)
         action, log_prob = act(critics.actor, seen, noise)

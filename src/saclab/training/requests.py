@@ -1,4 +1,4 @@
-"""What the outside asks of a run or of a grid of runs; looked at after every step."""
+"""What the outside asks of a run or of a grid of runs; looked at after every step, and within what takes longer."""
 
 from __future__ import annotations
 
@@ -27,4 +27,4 @@ class Requests:
 
 
 class Stopped(Exception):  # noqa: N818 - no error
-    """Asked to stop in the middle of an evaluation, whose episodes so far count for nothing."""
+    """Asked to stop in the middle of an evaluation, which counts for nothing and is made again."""

@@ -49,6 +49,7 @@ from saclab.records import (
 )
 from saclab.training.logs import evaluation_columns
 from saclab.training.manifest import CheckpointError, newest_first, read_manifest
+from saclab.training.saved_state import files_in
 
 FORMAT = 1
 LONGEST_NAME = 200
@@ -159,15 +160,6 @@ def recorded_files(run: Path, result: Result | None) -> dict[str, FileRecord]:
         with suppress(CheckpointError):
             return files_in(read_manifest(path).state)
     return {}
-
-
-def files_in(state: Mapping[str, Any]) -> dict[str, FileRecord]:
-    """What a checkpoint's state records of files; older ones have the logs' lengths only. Raises CheckpointError."""
-    try:
-        found = msgspec.convert(state.get("logs"), dict[str, Count | FileRecord])
-    except msgspec.ValidationError as error:
-        raise CheckpointError(f"the checkpoint's entry 'logs' is not what saclab writes: {error}") from error
-    return {name: FileRecord(entry) if isinstance(entry, int) else entry for name, entry in found.items()}
 
 
 class RunRecord(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,32 +13,12 @@ from saclab.errors import NonFiniteError
 from saclab.training import seeds
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.exploration import Exploration
+from saclab.training.manifest import Moment
 from saclab.training.reward_scale import RewardScale
+from saclab.training.saved_state import Counters
 
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
 EVALUATE_FIRST = -1  # for `evaluation_slots`: an evaluation is due before the next step
-
-
-@dataclass
-class Counters:
-    """Where a run stands, in plain values."""
-
-    steps: int = 0
-    """Environment steps, over all environments."""
-    updates: int = 0
-    episodes: int = 0
-    """Training episodes that ended after the random steps."""
-    running_average: float | None = None
-    """Average of the training episodes' returns, recent ones weighing most."""
-    evaluations: int = 0
-    evaluation_slots: int = 0
-    """Multiples of the evaluation interval that were reached."""
-    evaluated_at_update: int = -1
-    best_return: float | None = None
-    best_at_episode: int = 0
-    last_return: float | None = None
-    seconds: float = 0.0
-    """Wall-clock time."""
 
 
 class RunState:
@@ -87,6 +66,11 @@ class RunState:
         counters.running_average = kept + (1 - RUNNING_AVERAGE_KEEP) * episode.total_reward
         return counters.episodes
 
+    @property
+    def updates_left(self) -> int:
+        """Updates that the steps so far make due and that have not been made: above 0, a round is under way."""
+        return self.config.training.updates_due(self.counters.steps) - self.counters.updates
+
     # --- evaluations
 
     def evaluation_due(self) -> bool:
@@ -105,9 +89,11 @@ class RunState:
         """An evaluation was broken off: it comes first when the run goes on."""
         self.counters.evaluation_slots = EVALUATE_FIRST
 
-    @property
-    def evaluation_postponed(self) -> bool:
-        return self.counters.evaluation_slots == EVALUATE_FIRST
+    def moment(self) -> Moment:
+        """Where the run stands, as its checkpoints are named."""
+        counters, whole = self.counters, self.updates_left <= 0
+        tested = counters.evaluation_slots != EVALUATE_FIRST
+        return Moment(counters.steps, whole, 0 if whole else counters.updates, tested)
 
     def evaluation_seeds(self) -> list[int]:
         """One for each episode of the next evaluation."""

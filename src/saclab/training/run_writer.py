@@ -10,8 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from saclab.environments.make import EnvironmentSpec
 from saclab.environments.vector import EndedEpisode
 from saclab.files import write_json
@@ -72,12 +70,13 @@ class RunWriter:
         number = run.count_episode(episode)
         average = counters.running_average if number else episode.total_reward
         assert average is not None
+        updates = counters.updates + run.updates_left  # after its last step's round, of which some may be left to make
         self.logs.episode(
-            number, counters.steps, counters.updates, episode.total_reward, average, episode.length,
-            int(episode.terminated), self._seconds(),
+            number, counters.steps, updates, episode.total_reward, average, episode.length, int(episode.terminated),
+            self._seconds(),
         )  # fmt: skip
         if number:
-            yield EpisodeEnded(number, counters.steps, counters.updates, episode.total_reward, average, episode.length)
+            yield EpisodeEnded(number, counters.steps, updates, episode.total_reward, average, episode.length)
 
     def log_updates(self) -> Iterator[Event]:
         """One line for the window of updates, whose metrics have been delivered; a new window begins.
@@ -142,12 +141,8 @@ class RunWriter:
         """
         began, counters = time.monotonic(), self.run.counters
         counters.seconds = self._seconds()
-        checkpoint = to_checkpoint(snapshot, environments)
-        checkpoint.state["logs"] = msgspec.to_builtins(self._files())
-        checkpoint.state["facts"] = self.facts
-        path = save_checkpoint(
-            self.folder / "checkpoints", counters.steps, checkpoint, snapshot.replay, self.run.evaluation_postponed
-        )
+        checkpoint = to_checkpoint(snapshot, environments, self._files(), self.facts)
+        path = save_checkpoint(self.folder / "checkpoints", self.run.moment(), checkpoint, snapshot.replay)
         return Saved(path, time.monotonic() - began)
 
     def _files(self) -> dict[str, FileRecord]:

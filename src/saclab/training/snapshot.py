@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from saclab.algorithm.types import LearnerState
 from saclab.config import Config
 from saclab.replay import RowLayout
-from saclab.training.captured import join_arrays, part, plain_numbers, require_like, restore_generator, split_arrays
+from saclab.training.captured import join_arrays, require_like, restore_generator, split_arrays
 from saclab.training.checkpoint import Arrays, Checkpoint, Replay
 from saclab.training.learners import finite_arrays, initial_learner, learner_from
 from saclab.training.manifest import CheckpointError
-from saclab.training.run_state import Counters, RunState
+from saclab.training.run_state import RunState
+from saclab.training.saved_state import Files, GeneratorState, MachineFacts, SavedState, read_state
 
 EnvironmentStates = list[dict[str, Any] | None]
 """What `TrainingEnvironments.capture` gives."""
@@ -54,8 +56,19 @@ def new_start(config: Config, layout: RowLayout) -> Start:
     return Start(RunState(config, layout.action_size), initial_learner(config, layout))
 
 
-def to_checkpoint(snapshot: Snapshot, environments: EnvironmentStates) -> Checkpoint:
+def to_checkpoint(
+    snapshot: Snapshot,
+    environments: EnvironmentStates,
+    logs: Files | None = None,
+    facts: Mapping[str, Any] | None = None,
+) -> Checkpoint:
     """Everything but the transitions, which lie in `snapshot.replay`.
+
+    Args:
+        snapshot: the run.
+        environments: the states of its environments.
+        logs: what its logs and config.json are now.
+        facts: of the machine, from `machine_facts`.
 
     Raises:
         NonFiniteError: if the run is not worth continuing.
@@ -72,15 +85,15 @@ def to_checkpoint(snapshot: Snapshot, environments: EnvironmentStates) -> Checkp
         groups["best"] = {"actor": run.best_actor}
     if run.config.training.acting_delay:
         groups["acting"] = {"actor": snapshot.behaviour}
-    exploration, groups["exploration"] = run.exploration.capture()
+    noise, groups["exploration"] = run.exploration.capture()
     groups["rewards"] = run.reward_scale.capture()
-    state = {
-        "counters": dataclasses.asdict(run.counters),
-        "environments": environment_states,
-        "exploration": exploration,
-        "sampling": run.sampling.bit_generator.state,
-    }
-    return Checkpoint({name: arrays for name, arrays in groups.items() if arrays}, state, snapshot.replay.added)
+    state = SavedState(
+        run.counters, environment_states, msgspec.convert(noise, GeneratorState),
+        msgspec.convert(run.sampling.bit_generator.state, GeneratorState), logs or {},
+        None if facts is None else MachineFacts(**facts),
+    )  # fmt: skip
+    groups = {name: arrays for name, arrays in groups.items() if arrays}
+    return Checkpoint(groups, msgspec.to_builtins(state), snapshot.replay.added)
 
 
 def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -> Start:
@@ -89,7 +102,7 @@ def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -
     Raises:
         CheckpointError: if it is not one of a run with this configuration.
     """
-    groups, state = checkpoint.groups, checkpoint.state
+    groups, state = checkpoint.groups, read_state(checkpoint.state)
     example = initial_learner(config, layout)
     learner = learner_from(groups.get("learner", {}), example)
     behaviour = None
@@ -100,15 +113,15 @@ def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -
     run.window = list(require_like("metrics", window, np.zeros((*window.shape[:1], len(run.metrics)), np.float32)))
     if "best" in groups:
         run.best_actor = require_like("best", groups["best"].get("actor"), np.asarray(example.actor.weights))
-    run.counters = Counters(**plain_numbers(state.get("counters"), dataclasses.asdict(Counters())))
+    run.counters = state.counters
     run.logged_updates = run.counters.updates - len(run.window)
     if run.counters.steps != checkpoint.transitions:
         raise CheckpointError(f"the checkpoint has {run.counters.steps} steps and {checkpoint.transitions} transitions")
-    run.exploration.restore(state.get("exploration"), groups.get("exploration", {}))
+    run.exploration.restore(msgspec.to_builtins(state.exploration), groups.get("exploration", {}))
     run.reward_scale.restore(groups.get("rewards", {}))
-    restore_generator("sampling", run.sampling, state.get("sampling"))
+    restore_generator("sampling", run.sampling, msgspec.to_builtins(state.sampling))
     like = np.zeros((config.training.parallel_environments, layout.observation_size), np.float32)
-    environments = join_arrays(groups.get("environments", {}), part(state, "environments", list), like)
+    environments = join_arrays(groups.get("environments", {}), state.environments, like)
     start = Start(run, learner, behaviour, environments)
     run.reward_scale.returns[start.restarting] = 0.0
     return start

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
+
 from saclab.config import Config
 from saclab.errors import UserError
 from saclab.files import write_json
-from saclab.machine import different_facts
+from saclab.machine import different_facts, other_simulation
 from saclab.records import FileRecord, RunDescription
 from saclab.replay import RowLayout
 from saclab.training.checkpoint import Checkpoint
@@ -17,7 +19,8 @@ from saclab.training.common_checkpoint import read_common
 from saclab.training.engine import Engine, EngineBuilder, EnvironmentStateError
 from saclab.training.manifest import FORMAT as CHECKPOINT_FORMAT
 from saclab.training.manifest import CheckpointError
-from saclab.training.run_folder import FORMAT, files_in, read_config
+from saclab.training.run_folder import FORMAT, read_config
+from saclab.training.saved_state import files_in, read_state
 from saclab.training.snapshot import Start, from_checkpoint, new_start
 
 
@@ -74,7 +77,7 @@ def continued(
     """Go on from a checkpoint of this folder."""
     try:
         start = from_checkpoint(config, layout, checkpoint)
-        logs = files_in(checkpoint.state)
+        logs, saved_facts = files_in(checkpoint.state), read_state(checkpoint.state).facts
     except CheckpointError as error:
         raise cannot_continue(folder, error) from error
     if start.restarting:
@@ -87,7 +90,9 @@ def continued(
             f"the checkpoint has format {checkpoint.format}, of an earlier saclab: from here on the results differ in "
             "the last bits from what they would have been"
         )
-    notes += different_facts(checkpoint.state.get("facts"), facts)
+    if saved_facts and (reason := other_simulation(saved_facts.versions, facts["versions"])):
+        raise UserError(f"cannot continue {folder}: {reason}")
+    notes += different_facts(msgspec.to_builtins(saved_facts), facts)
     return Beginning(start, logs, notes)
 
 

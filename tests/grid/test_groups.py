@@ -179,12 +179,12 @@ def test_the_delay_of_a_run_group_is_the_users_choice(tmp_path):
 
 def test_what_differs_between_variants_is_said_of_each(tmp_path, monkeypatch):
     monkeypatch.setitem(VARIANTS, "redq", Variant("REDQ", "", {"updates_per_interval": 20, "acting_delay": 1}))
-    cells = make_grid(["Pendulum-v1"], ["sac", "redq", "averaged"], "quick", 1, tmp_path)
+    cells = make_grid(["Pendulum-v1"], ["sac", "redq", "averaged"], "standard", 1, tmp_path)
     note = resources.group_note(cells, 4)
     assert "; sac, averaged: the environments wait for the updates (" in note
     assert "; redq: the policy that acts is one round of updates behind (acting_delay 1); " in note
-    assert "; sac, averaged: 1 update(s) per 2 environment step(s): update-to-data ratio 0.5; " in note
-    assert note.endswith("; redq: 20 update(s) per 2 environment step(s): update-to-data ratio 10")
+    assert "; sac, averaged: 1 update(s) per 1 environment step(s): update-to-data ratio 1; " in note
+    assert note.endswith("; redq: 20 update(s) per 1 environment step(s): update-to-data ratio 20")
 
 
 @pytest.mark.parametrize("present", [True, False])

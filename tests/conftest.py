@@ -52,6 +52,7 @@ def variant_case(variant: str) -> AlgorithmSettings:
     own = variant_settings(variant, "AnyEnvironment-v0")
     small = SMALL | {
         "critic_hidden_layers": (9, 6) if own.critic_hidden_layers else None,
+        "hidden_layers": SMALL["hidden_layers"][: len(own.hidden_layers)],
         "critics": min(own.critics, 4),
         "critic_atoms": 5,
         "critic_dropout": 0.25 if own.critic_dropout else 0.0,

@@ -26,7 +26,7 @@ such settings only can be trained as one run group."""
 Whole = Annotated[int, PLAIN_NUMBER]
 
 Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
-NetworkName = Literal["mlp", "layer_norm_mlp", "batch_norm_mlp"]
+NetworkName = Literal["mlp", "layer_norm_mlp", "batch_norm_mlp", "batch_renorm_mlp"]
 Reduction = Literal["minimum", "mean"]
 
 

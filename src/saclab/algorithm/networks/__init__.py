@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from saclab.algorithm.networks.batch_norm_mlp import batch_norm_mlp
+from saclab.algorithm.networks.batch_norm_mlp import batch_norm_mlp, batch_renorm_mlp
 from saclab.algorithm.networks.layer_norm_mlp import layer_norm_mlp
 from saclab.algorithm.networks.mlp import mlp
 from saclab.algorithm.networks.network import Design, Network
@@ -14,6 +14,7 @@ NETWORKS: dict[str, Callable[[int, tuple[int, ...], int, Design], Network]] = {
     "mlp": mlp,
     "layer_norm_mlp": layer_norm_mlp,
     "batch_norm_mlp": batch_norm_mlp,
+    "batch_renorm_mlp": batch_renorm_mlp,
 }
 """Name -> (inputs, hidden layers, outputs, design) -> Network."""
 

@@ -128,17 +128,17 @@ def test_reproduce_forecasts_trains_and_says_that_it_is_scaled_down(tmp_path: Pa
     assert "runs to do" not in saclab(*arguments, folder=tmp_path).stdout, "nothing is left to do"
 
 
-def test_variants_and_protocols_are_listed(tmp_path: Path) -> None:
-    variants = saclab("variants", folder=tmp_path).stdout
+def test_variants_and_protocols_are_listed(saclab_again: Callable[..., Told]) -> None:
+    variants = saclab_again("variants").output
     assert all(name in variants for name in ("sac", "sac-auto", "averaged", "averaged-auto", "averaged-entropy"))
-    protocols = saclab("protocols", folder=tmp_path).stdout
+    protocols = saclab_again("protocols").output
     assert all(name in protocols for name in ("paper", "standard", "quick"))
 
 
-def test_help_shows_the_values_of_the_variant_and_protocol_named(tmp_path: Path) -> None:
-    told = saclab("train", "Humanoid-v4", "--variant", "averaged", "--protocol", "paper", "--help", folder=tmp_path)
-    assert told.returncode == 0
-    words = " ".join(told.stdout.replace("│", " ").split())
+def test_help_shows_the_values_of_the_variant_and_protocol_named(saclab_again: Callable[..., Told]) -> None:
+    told = saclab_again("train", "Humanoid-v4", "--variant", "averaged", "--protocol", "paper", "--help")
+    assert told.status == 0
+    words = " ".join(told.output.replace("│", " ").split())
     assert "(default: 1500000)" in words
     assert "initial-temperature FLOAT α, or its first value if it is learned. (default: 0.1)" in words
 
@@ -280,13 +280,13 @@ def test_bad_input_gets_a_clear_line_and_status_2(
     assert not (tmp_path / "runs").exists(), "nothing may be left behind"
 
 
-def test_a_folder_with_other_settings_is_refused_and_kept(trained: Path) -> None:
+def test_a_folder_with_other_settings_is_refused_and_kept(trained: Path, saclab_again: Callable[..., Told]) -> None:
     before = (run_folder(trained) / "config.json").read_bytes()
-    result = saclab(
+    told = saclab_again(
         "train", "Pendulum-v1", "--variant", "sac", "--protocol", "quick", *SHORT, "--discount", "0.9", folder=trained
     )
-    assert result.returncode == 2
-    assert "discount is 0.99 there, 0.9 here" in result.stderr
+    assert told.status == 2
+    assert "discount is 0.99 there, 0.9 here" in told.errors
     assert (run_folder(trained) / "config.json").read_bytes() == before
 
 

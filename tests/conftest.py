@@ -178,13 +178,24 @@ def make_case(settings: AlgorithmSettings) -> Case:
     return Case(settings, learner, scalars(settings, ACTION_SIZE, planned_updates=10), compiled, traces)
 
 
-@pytest.fixture(params=VARIANT_CASES | MORE_CASES)
+def as_parameters(cases: dict[str, AlgorithmSettings]) -> list[Any]:
+    """Each case by its name; one that only combines values that earlier cases have is slow."""
+    seen: set[tuple[str, str]] = set()
+    parameters = []
+    for name, settings in cases.items():
+        values = {(setting, repr(value)) for setting, value in dataclasses.asdict(settings).items()}
+        parameters.append(pytest.param(name, marks=[] if values - seen else pytest.mark.slow))
+        seen |= values
+    return parameters
+
+
+@pytest.fixture(params=as_parameters(VARIANT_CASES | MORE_CASES))
 def case(request: pytest.FixtureRequest) -> Case:
     """Every variant, and settings that no variant uses."""
     return make_case((VARIANT_CASES | MORE_CASES)[request.param])
 
 
-@pytest.fixture(params=VARIANT_CASES)
+@pytest.fixture(params=as_parameters(VARIANT_CASES))
 def variant(request: pytest.FixtureRequest) -> Case:
     """Every variant."""
     return make_case(VARIANT_CASES[request.param])

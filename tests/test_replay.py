@@ -9,7 +9,7 @@ from scipy.stats import chisquare
 
 from saclab.environments.vector import Transitions
 from saclab.machine import available_memory
-from saclab.replay import ReplayBuffer, RowLayout
+from saclab.replay import ReplayBuffer, RowLayout, Windows
 
 LAYOUT = RowLayout(observation_size=3, action_size=2)
 
@@ -112,3 +112,77 @@ def test_this_machine_has_some_memory_left():
     available = available_memory()
     assert available is not None
     assert 2**20 < available < 2**50
+
+
+def stepped(episodes: list[list[tuple[float, bool]]], capacity: int) -> ReplayBuffer:
+    """A buffer of several environments stepped in turn, each with rewards and whether a step was terminal.
+
+    The states of environment e are e + 0.01, e + 0.02, …; a reward of None is a time limit: the next state is new.
+    """
+    layout = RowLayout(1, 1)
+    buffer, states = ReplayBuffer(capacity, layout), [float(number) for number in range(len(episodes))]
+    for steps in zip(*episodes, strict=True):
+        rows = []
+        for number, (reward, how) in enumerate(steps):
+            before, after = states[number], states[number] + 0.01
+            states[number] = after if how == "on" else states[number] + 0.1
+            rows.append((before, 0.0, reward, after, how == "terminal"))
+        columns = [np.array(column, np.float32) for column in zip(*rows, strict=True)]
+        buffer.add(Transitions(*(column[:, None] for column in columns[:4]), columns[4] > 0))
+    return buffer
+
+
+def batch_of(buffer: ReplayBuffer, windows: Windows, drawn: list[int], discount: float):
+    gathered, steps = windows.gather(buffer.rows, np.array(drawn), np.int64(buffer.added % buffer.capacity))
+    return buffer.layout.unpack_windows(gathered, jax.numpy.asarray(steps), np.float32(discount))
+
+
+def test_windows_by_hand():
+    """Of three steps: whole ones, one cut by a terminal state, by a time limit, by the end of what is stored."""
+    one = [(1.0, "on"), (2.0, "on"), (4.0, "on"), (8.0, "terminal"), (16.0, "on"), (32.0, "limit"), (64.0, "on")]
+    other = [(100.0, "on"), (200.0, "limit"), (400.0, "on"), (800.0, "on"), (1600.0, "on"), (0.0, "on"), (0.0, "on")]
+    buffer, windows = stepped([one, other], capacity=20), Windows(RowLayout(1, 1), 3, 2)
+    # the first environment's steps lie in rows 0, 2, 4, …, the other's in 1, 3, 5, …
+    batch = batch_of(buffer, windows, [0, 2, 4, 6, 8, 10, 12, 1, 3, 5, 11], 0.5)
+    assert batch.steps.tolist() == [3, 3, 2, 1, 2, 1, 1, 2, 1, 3, 2]
+    assert batch.reward_terms[:, 0].tolist() == [
+        1 + 1 + 1, 2 + 2 + 2, 4 + 4, 8, 16 + 16, 32, 64, 100 + 100, 200, 400 + 400 + 400, 0,
+    ]  # fmt: skip
+    assert batch.terminated.tolist() == [0, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0]
+    first = batch.observation[:, 0]
+    np.testing.assert_allclose(batch.next_observation[:3, 0] - first[:3], [0.03, 0.03, 0.02], atol=1e-5)
+
+
+def test_windows_do_not_reach_over_the_newest_row_of_a_full_ring():
+    """Seven places for two environments: what follows the newest row is the oldest one."""
+    buffer = stepped([[(float(number), "on") for number in range(6)]] * 2, capacity=7)
+    batch = batch_of(buffer, Windows(RowLayout(1, 1), 3, 2), list(range(7)), 1.0)
+    # rows hold the transitions 7, 8, 9, 10, 11, 5, 6: of the steps 3, 4, 4, 5, 5, 2, 3
+    assert batch.steps.tolist() == [3, 2, 2, 1, 1, 3, 3]
+    assert batch.reward_terms[:, 0].tolist() == [12, 9, 9, 5, 5, 9, 12]
+
+
+@pytest.mark.parametrize("to_array", [np.asarray, jax.numpy.asarray], ids=["numpy", "jax"])
+def test_windows_of_random_episodes_equal_a_plain_walk(to_array):
+    generator, discount, longest = np.random.default_rng(3), 0.9, 4
+    hows = generator.choice(["on", "on", "on", "terminal", "limit"], (3, 40))
+    rewards = generator.standard_normal((3, 40)).astype(np.float32)
+    buffer = stepped([list(zip(own, how, strict=True)) for own, how in zip(rewards, hows, strict=True)], capacity=50)
+    drawn = generator.integers(0, buffer.size, 200)
+    windows, end = Windows(RowLayout(1, 1), longest, 3), buffer.added % buffer.capacity
+    gathered, steps = windows.gather(to_array(buffer.rows), to_array(drawn), to_array(end))
+    batch = buffer.layout.unpack_windows(jax.numpy.asarray(gathered), jax.numpy.asarray(steps), np.float32(discount))
+    oldest = buffer.added - buffer.capacity
+    for row, place in enumerate(drawn):
+        number = oldest + (place - oldest) % buffer.capacity  # of the transition that lies there
+        total, length = 0.0, 0
+        step, environment = divmod(int(number), 3)
+        while True:
+            total += discount**length * rewards[environment, step + length]
+            length += 1
+            last = step + length - 1
+            if hows[environment, last] != "on" or length == longest or last + 1 == 40:
+                break
+        assert int(batch.steps[row]) == length
+        assert float(batch.reward_terms[row, 0]) == pytest.approx(total, abs=1e-5)
+        assert bool(batch.terminated[row]) == (hows[environment, last] == "terminal")

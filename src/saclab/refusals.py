@@ -38,7 +38,15 @@ def require_ranges(settings: AlgorithmSettings) -> None:
     check(
         "target_critics", lambda value: value is None or value >= 1, "use a whole number of at least 1, or leave it out"
     )
-    for name in ("batch_size", "critics", "snapshot_interval", "entropy_window", "actor_interval", "longest_noise"):
+    for name in (
+        "batch_size",
+        "critics",
+        "snapshot_interval",
+        "entropy_window",
+        "actor_interval",
+        "longest_noise",
+        "n_step",
+    ):
         check(name, lambda value: value >= 1, "use a whole number of at least 1")
     for name in ("critic_learning_rate", "actor_learning_rate", "temperature_learning_rate"):
         check(name, lambda value: 0 <= value < 1, "use a value in [0, 1), such as 3e-4")

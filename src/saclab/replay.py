@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import accumulate
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from saclab.algorithm.networks.network import Array
@@ -52,10 +53,72 @@ class RowLayout(NamedTuple):
         }
         return Batch(**parts | {"terminated": parts["terminated"][:, 0]})
 
+    def unpack_windows(self, windows: Array, steps: Array, discount: Array) -> Batch:
+        """A batch of windows f32[B, n, width], of which the first `steps` i32[B] transitions of each count.
+
+        A row goes from the first observation to the last next one; each of its reward terms is the sum over
+        i of γⁱ times that of transition i.
+        """
+        size, longest, _ = windows.shape
+        places = jnp.arange(longest)
+        weight = jnp.where(places < steps[:, None], discount**places, 0)
+        first = self.unpack(windows[:, 0])
+        last = self.unpack(windows[jnp.arange(size), steps - 1])
+        terms = self.unpack(windows.reshape(size * longest, -1)).reward_terms.reshape(size, longest, -1)
+        return Batch(
+            first.observation, first.action, jnp.sum(weight[:, :, None] * terms, axis=1), last.next_observation,
+            last.terminated, steps.astype(jnp.float32),
+        )  # fmt: skip
+
 
 def layout_of(spec: EnvironmentSpec, settings: AlgorithmSettings) -> RowLayout:
     """The columns of a run's transitions."""
     return RowLayout(spec.observation_size, spec.action_size, len(settings.reward_terms) + 1)
+
+
+class Windows(NamedTuple):
+    """How rows that follow each other in an episode are found in a ring of rows.
+
+    Rows lie as they were stored, those of one step of all environments side by side, so the next row of an episode lies
+    as many places on as there are environments. It belongs to the same episode if it begins with the observation at
+    which the row before ended. (Where an episode starts in the very state in which a time limit cut the one before,
+    going on is right as well: what follows a state does not depend on how it was reached.)
+    """
+
+    layout: RowLayout
+    longest: int
+    """n: transitions in a window at most."""
+    environments: int
+
+    def gather(self, rows: Array, drawn: Array, end: Array) -> tuple[Array, Array]:
+        """The windows that begin at some rows, NumPy or JAX.
+
+        Args:
+            rows: f32[capacity, width], a ring.
+            drawn: i[B], places of their first rows.
+            end: i[], the place behind the newest row.
+
+        Returns:
+            f32[B, n, width], and how many transitions of each count, i[B]: up to a terminal state, to a time limit, to
+            the newest row.
+        """
+        xp = rows.__array_namespace__()
+        capacity = len(rows)
+        ahead = xp.arange(self.longest) * self.environments
+        windows = rows[(drawn[:, None] + ahead) % capacity]
+        size = len(drawn)
+        batch = self.layout.unpack(windows.reshape(size * self.longest, -1))
+        observation = batch.observation.reshape(size, self.longest, -1)
+        next_observation = batch.next_observation.reshape(size, self.longest, -1)
+        ended = batch.terminated.reshape(size, self.longest) > 0
+        stored = ahead <= ((end - 1 - drawn) % capacity)[:, None]
+        follows = xp.all(observation[:, 1:] == next_observation[:, :-1], axis=2) & ~ended[:, :-1] & stored[:, 1:]
+        return windows, 1 + xp.sum(xp.cumprod(follows.astype(xp.int32), axis=1), axis=1)
+
+    def packed(self, rows: np.ndarray, drawn: np.ndarray, end: int) -> np.ndarray:
+        """What `gather` finds, f32[B, n · width + 1]: one array on the way to a device."""
+        windows, steps = self.gather(rows, drawn, np.int64(end))
+        return np.concatenate([windows.reshape(len(drawn), -1), steps[:, None]], axis=1, dtype=np.float32)
 
 
 class ReplayBuffer:
@@ -89,6 +152,10 @@ class ReplayBuffer:
         """f32[batch_size, width], each row drawn uniformly and independently."""
         rows: np.ndarray = self.rows[draw(generator, self.size, batch_size)]
         return rows
+
+    def sample_windows(self, generator: np.random.Generator, batch_size: int, windows: Windows) -> np.ndarray:
+        """f32[batch_size, n · width + 1]: windows that begin at rows drawn as by `sample`, and how long each is."""
+        return windows.packed(self.rows, draw(generator, self.size, batch_size), self.added % self.capacity)
 
 
 def draw(generator: np.random.Generator, size: int, batch_size: int) -> np.ndarray:

@@ -94,6 +94,9 @@ class AlgorithmSettings:
     ran as "Averaged-SAC". The rows are unrelated to each other; this is not Eq. 9. 1 is plain SAC."""
     target_critics: int | None = None
     """Critics, drawn anew for each update, whose targets value the next state; None is all of them."""
+    n_step: int = 1
+    """Transitions whose discounted rewards come before the value of the state they lead to, as far as the episode and
+    the replay buffer reach. 1 is plain SAC."""
     target_reduction: Literal["minimum", "mean", "truncated"] = "minimum"
     """How the critics are reduced to one Q in the target (Eq. 4); truncated: the quantiles of all of them together,
     without the largest."""

@@ -154,6 +154,23 @@ def assert_alike(actual, desired, name: str) -> None:
     assert apart.max() < 0.03, name
 
 
+def test_rewards_of_several_steps_come_before_a_value_discounted_as_often(case_of):
+    """Rows of one to three steps, of which one ends: the target is the reward and γᵐ times the soft value."""
+    case = case_of("sac/mlp", batch_size=3)
+    state, batch = case.initial_state(), case.batch(np.random.default_rng(0))
+
+    def target(**changes) -> float:
+        return case.report(case.update(state, batch._replace(reward_terms=np.zeros((3, 1), np.float32), **changes), 0))[
+            "target_mean"
+        ]
+
+    rows = np.eye(3, dtype=np.float32)
+    values = [target(terminated=1 - row) * 3 / case.settings.discount for row in rows]
+    steps, discount = np.array([1, 2, 3], np.float32), case.settings.discount
+    expected = (values[0] * discount + values[2] * discount**3) / 3
+    assert target(terminated=rows[1], steps=steps) == pytest.approx(expected, rel=1e-5)
+
+
 def test_averaging_over_one_snapshot_or_minibatch_is_sac_by_its_settings(case_of):
     plain = case_of("sac/mlp").settings
     assert case_of("averaged/mlp", snapshots=1).settings == plain

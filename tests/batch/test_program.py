@@ -11,7 +11,7 @@ from axes import AXES
 from saclab.algorithm.scalars import pack, scalars
 from saclab.algorithm.types import Context
 from saclab.batch.program import Program, StepInputs
-from saclab.replay import RowLayout
+from saclab.replay import RowLayout, Windows
 from saclab.settings import structure
 from saclab.training import seeds
 from saclab.training.learners import compiled_init, compiled_update, named_leaves
@@ -38,6 +38,8 @@ def test_each_slot_is_updated_by_its_own_numbers(changes):
     states = [init(own, seeds.learner_key(run)) for run, own in enumerate(numbers)]
     random = np.random.default_rng(0)
     rows = random.standard_normal((len(settings), CAPACITY, LAYOUT.width)).astype(np.float32)
+    rows[:, np.arange(2, CAPACITY), :3] = rows[:, np.arange(CAPACITY - 2), 6:9]  # two episodes, one after another
+    rows[..., 9] = random.uniform(size=rows.shape[:2]) < 0.2  # or some
     drawn = random.integers(0, CAPACITY, (len(settings), 5, 16), np.int32)
 
     program = Program(shape, LAYOUT, environments=2, slots=len(settings))
@@ -59,7 +61,11 @@ def test_each_slot_is_updated_by_its_own_numbers(changes):
         expected = states[run]
         for turn in range(5):
             now = Context(np.int32(turn), np.ones(1, np.float32), np.float32(1))
-            expected, values = update(own, expected, rows[run][drawn[run, turn]], now)
+            batch = rows[run][drawn[run, turn]]
+            if shape.n_step > 1:
+                batch = Windows(LAYOUT, shape.n_step, 2).packed(rows[run], drawn[run, turn], 1)
+                assert set(batch[:, -1]) == {1, 2, 3}
+            expected, values = update(own, expected, batch, now)
             np.testing.assert_allclose(metrics[run, turn], values, rtol=2e-4, atol=tolerance)
         found = named_leaves(jax.tree.map(lambda leaf, run=run: leaf[run], state))
         assert found.keys() == named_leaves(expected).keys()

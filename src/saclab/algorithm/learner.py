@@ -172,7 +172,8 @@ def update_critic(
         state.entropy_terms, jnp.exp(state.temperature.weights) * next_log_prob, context.step
     )
     reward = jnp.sum(batch.reward_terms * context.reward_weights, axis=1) / context.reward_scale
-    discount = numbers["discount"] * (1 - batch.terminated)
+    over_steps = numbers["discount"] if batch.steps is None else numbers["discount"] ** batch.steps
+    discount = over_steps * (1 - batch.terminated)
 
     def objective(critic: jax.Array) -> tuple[jax.Array, tuple[jax.Array, dict[str, jax.Array]]]:
         outputs, next_outputs, statistics = forward(

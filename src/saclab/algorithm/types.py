@@ -23,6 +23,8 @@ class Batch(NamedTuple):
     """f32[B, O]."""
     terminated: jax.Array
     """f32[B], 1 where the episode ended in a terminal state. A time limit (truncation) is not one."""
+    steps: jax.Array | None = None
+    """f32[B]: transitions from the observation to the next one, whose rewards are added up; None: one in each row."""
 
 
 class Context(NamedTuple):

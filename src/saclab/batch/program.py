@@ -22,8 +22,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from saclab.algorithm.learner import make_learner
 from saclab.algorithm.scalars import unpack
-from saclab.algorithm.types import Context, LearnerState, Trained
-from saclab.replay import RowLayout
+from saclab.algorithm.types import Batch, Context, LearnerState, Trained
+from saclab.replay import RowLayout, Windows
 from saclab.settings import AlgorithmSettings
 from saclab.training.process import compiled
 
@@ -156,11 +156,18 @@ class Program:
         inputs = self.inputs(updates)
         positions = (inputs.unpack(packed, "position") + jnp.arange(self.environments)) % len(replay)
         replay = replay.at[positions].set(inputs.unpack(packed, "rows"))
+        plain_numbers = unpack(numbers)
+
+        def batch_of(drawn: jax.Array) -> Batch:
+            if self.settings.n_step == 1:
+                return self.layout.unpack(replay[drawn])
+            windows = Windows(self.layout, self.settings.n_step, self.environments)
+            gathered, steps = windows.gather(replay, drawn, positions[-1] + 1)
+            return self.layout.unpack_windows(gathered, steps, plain_numbers["discount"])
 
         def update(state: LearnerState, of_update: tuple[jax.Array, jax.Array]) -> tuple[LearnerState, jax.Array]:
             drawn, step = of_update
-            batch = self.layout.unpack(replay[drawn])
-            state = self.learner.update(unpack(numbers), state, batch, context._replace(step=step))
+            state = self.learner.update(plain_numbers, state, batch_of(drawn), context._replace(step=step))
             return state, state.report
 
         drawn, steps = inputs.unpack(packed, "drawn"), context.step + jnp.arange(updates, dtype=jnp.int32)

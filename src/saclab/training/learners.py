@@ -15,7 +15,7 @@ import numpy as np
 
 from saclab.algorithm.learner import Learner, make_learner
 from saclab.algorithm.scalars import pack, scalars, unpack
-from saclab.algorithm.types import Context, LearnerState
+from saclab.algorithm.types import Batch, Context, LearnerState
 from saclab.config import Config
 from saclab.errors import NonFiniteError
 from saclab.replay import RowLayout
@@ -62,11 +62,20 @@ def compiled_update(
     Compiled once for all settings of a `structure`.
     """
     learner = learner_of(shape, layout)
+    longest = shape.n_step
+
+    def batch_of(rows: jax.Array, discount: jax.Array) -> Batch:
+        """Rows f32[B, width], or windows f32[B, n · width + 1] with their lengths."""
+        if longest == 1:
+            return layout.unpack(rows)
+        windows = rows[:, :-1].reshape(len(rows), longest, layout.width)
+        return layout.unpack_windows(windows, rows[:, -1].astype(jnp.int32), discount)
 
     def update(
         numbers: jax.Array, state: LearnerState, rows: jax.Array, context: Context
     ) -> tuple[LearnerState, jax.Array]:
-        state = learner.update(unpack(numbers), state, layout.unpack(rows), context)
+        plain_numbers = unpack(numbers)
+        state = learner.update(plain_numbers, state, batch_of(rows, plain_numbers["discount"]), context)
         return state, state.report
 
     return compiled(update, donate_argnums=1)

@@ -13,7 +13,7 @@ from saclab.config import Config
 from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import RunBroken
 from saclab.memory import require_memory
-from saclab.replay import ReplayBuffer, layout_of
+from saclab.replay import ReplayBuffer, Windows, layout_of
 from saclab.settings import structure
 from saclab.training import seeds
 from saclab.training.checkpoint import Checkpoint, read_checkpoint
@@ -108,7 +108,7 @@ class LocalEngine:
     def make_updates(self, should_pause: Callable[[], bool] = never) -> None:
         run, counters = self.run, self.run.counters
         for _ in range(run.updates_left):
-            rows = self.replay.sample(run.sampling, run.config.algorithm.batch_size)
+            rows = self._sample()
             context = self.context._replace(step=np.int32(counters.updates))
             self.learner_state, metrics = self.update(self.numbers, self.learner_state, rows, context)
             run.window.append(metrics)
@@ -117,6 +117,14 @@ class LocalEngine:
             jax.block_until_ready(run.window[-IN_FLIGHT : 1 - IN_FLIGHT])  # type: ignore[no-untyped-call]
             if should_pause():
                 return
+
+    def _sample(self) -> np.ndarray:
+        """What an update learns from: rows f32[B, width], or windows of several."""
+        settings, run = self.run.config.algorithm, self.run
+        if settings.n_step == 1:
+            return self.replay.sample(run.sampling, settings.batch_size)
+        windows = Windows(self.replay.layout, settings.n_step, len(self.environments))
+        return self.replay.sample_windows(run.sampling, settings.batch_size, windows)
 
     def _next_action(self) -> np.ndarray:
         """f32[N, A] in [-1, 1]: uniform during the random steps, then a sample of the policy."""

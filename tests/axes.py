@@ -6,6 +6,7 @@ from typing import Any
 
 AXES: dict[str, dict[str, Any]] = {
     "held noise and scaled rewards": {"longest_noise": 16, "reward_scaling": "deviation_or_bound"},
+    "normalised observations": {"observation_normalisation": "running"},
     "reward terms": {"reward_terms": ("reward_run", "reward_ctrl"), "reward_weights": (0.5, 2.0)},
     "batch normalisation, joint, without a target": {
         "network": "batch_norm_mlp", "joint_forward": True, "actor_joint_forward": True, "snapshots": 0,

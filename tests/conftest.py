@@ -52,6 +52,7 @@ def variant_case(variant: str) -> AlgorithmSettings:
     own = variant_settings(variant, "AnyEnvironment-v0")
     small = SMALL | {
         "critic_hidden_layers": (9, 6) if own.critic_hidden_layers else None,
+        "hidden_layers": SMALL["hidden_layers"][: len(own.hidden_layers)],
         "critics": min(own.critics, 4),
         "critic_atoms": 5,
         "critic_dropout": 0.25 if own.critic_dropout else 0.0,
@@ -177,13 +178,24 @@ def make_case(settings: AlgorithmSettings) -> Case:
     return Case(settings, learner, scalars(settings, ACTION_SIZE, planned_updates=10), compiled, traces)
 
 
-@pytest.fixture(params=VARIANT_CASES | MORE_CASES)
+def as_parameters(cases: dict[str, AlgorithmSettings]) -> list[Any]:
+    """Each case by its name; one that only combines values that earlier cases have is slow."""
+    seen: set[tuple[str, str]] = set()
+    parameters = []
+    for name, settings in cases.items():
+        values = {(setting, repr(value)) for setting, value in dataclasses.asdict(settings).items()}
+        parameters.append(pytest.param(name, marks=[] if values - seen else pytest.mark.slow))
+        seen |= values
+    return parameters
+
+
+@pytest.fixture(params=as_parameters(VARIANT_CASES | MORE_CASES))
 def case(request: pytest.FixtureRequest) -> Case:
     """Every variant, and settings that no variant uses."""
     return make_case((VARIANT_CASES | MORE_CASES)[request.param])
 
 
-@pytest.fixture(params=VARIANT_CASES)
+@pytest.fixture(params=as_parameters(VARIANT_CASES))
 def variant(request: pytest.FixtureRequest) -> Case:
     """Every variant."""
     return make_case(VARIANT_CASES[request.param])

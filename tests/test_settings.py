@@ -10,6 +10,7 @@ from saclab.algorithm.learner import UPDATES
 from saclab.algorithm.losses import FACTORS
 from saclab.algorithm.networks import NETWORKS
 from saclab.algorithm.networks.network import ACTIVATIONS, INITIALISATIONS, PROJECTIONS
+from saclab.algorithm.networks.normalised_inputs import INPUT_NORMALISATIONS
 from saclab.algorithm.optimizer import SCHEDULES
 from saclab.algorithm.scalars import ELSEWHERE, pack, scalars, unpack
 from saclab.algorithm.targets import REDUCTIONS, TARGET_REDUCTIONS
@@ -29,6 +30,7 @@ TABLES = {
     "temperature_gradient": FACTORS,
     "weight_projection": PROJECTIONS,
     "initialisation": INITIALISATIONS,
+    "observation_normalisation": INPUT_NORMALISATIONS,
     "reward_scaling": SCALES,
 }
 """Setting -> what its names stand for. `settings.py` imports no numerical library, so the names are written twice."""

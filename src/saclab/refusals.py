@@ -108,7 +108,7 @@ def require_possible_critics(settings: AlgorithmSettings) -> None:
         "critic_dropout", settings.critic_dropout,
         f"use critic_network layer_norm_mlp: {settings.network_of_critic} has no dropout",
     )  # fmt: skip
-    own = {settings.network, settings.network_of_critic} - {"mlp", "layer_norm_mlp"}
+    own = {settings.network, settings.network_of_critic} - {"mlp", "layer_norm_mlp", "batch_renorm_mlp"}
     require(
         settings.initialisation == "network" or not own,
         "initialisation", settings.initialisation, f"use network: {', '.join(sorted(own))} starts in a way of its own",

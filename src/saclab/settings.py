@@ -26,7 +26,7 @@ such settings only can be trained as one run group."""
 Whole = Annotated[int, PLAIN_NUMBER]
 
 Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
-NetworkName = Literal["mlp", "layer_norm_mlp", "batch_norm_mlp"]
+NetworkName = Literal["mlp", "layer_norm_mlp", "batch_norm_mlp", "batch_renorm_mlp"]
 Reduction = Literal["minimum", "mean"]
 
 
@@ -132,6 +132,8 @@ class AlgorithmSettings:
     longest_noise: int = 1
     """Most steps for which one draw of the exploration noise is held; how many, n, is drawn with a probability
     proportional to n⁻². 1 is a draw for each step."""
+    observation_normalisation: Literal["none", "running"] = "none"
+    """Whether observations are normalised by the running mean and deviation of all that the run has met."""
     reward_terms: tuple[str, ...] = ()
     """Names of reward terms in the `info` of an environment's step; what they leave of the reward is a term too."""
     reward_weights: Annotated[tuple[float, ...], PLAIN_NUMBER] = ()

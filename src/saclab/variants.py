@@ -45,6 +45,16 @@ ENSEMBLE = LEARNED | {
     "random_steps": 5_000,
 }
 """What REDQ and DroQ share: many updates per environment step, the policy's at every twentieth."""
+SCALED_RETURNS = {
+    "temperature": "learned",
+    "initial_temperature": 0.01,
+    "temperature_gradient": "alpha",
+    "critic_head": "categorical",
+    "critic_atoms": 101,
+    "critic_bound": 5.0,
+    "log_std_minimum": -10.0,
+}
+"""What XQC, SimbaV2 and FlashSAC share: a distribution over returns that scaled rewards hold within bounds."""
 ENSEMBLE_ENTROPY = {"Hopper-": -1.0, "HalfCheetah-": -3.0, "Walker2d-": -3.0, "Ant-": -4.0, "Humanoid-": -2.0}
 """Target entropies of MBPO, REDQ and DroQ."""
 DROPOUT = {"Hopper-": 0.0001, "Walker2d-": 0.005, "Humanoid-": 0.1}
@@ -114,6 +124,46 @@ VARIANTS: dict[str, Variant] = {
         },
         {"HalfCheetah-": {"dropped_quantiles": 0}, "Hopper-": {"dropped_quantiles": 5}},
         source="Kuznetsov et al. 2020",
+    ),
+    "crossq": Variant(
+        "CrossQ",
+        "No target network: wide critics with batch renormalisation see both states in one pass.",
+        LEARNED
+        | {
+            "network": "batch_renorm_mlp",
+            "critic_hidden_layers": (2048, 2048),
+            "snapshots": 0,
+            "joint_forward": True,
+            "adam_beta_1": 0.5,
+            "actor_learning_rate": 1e-3,
+            "critic_learning_rate": 1e-3,
+            "temperature_learning_rate": 1e-3,
+            "actor_interval": 3,
+            "random_steps": 5_000,
+        },
+        source="Bhatt et al. 2024",
+    ),
+    "xqc": Variant(
+        "XQC",
+        "Batch normalisation, unit weights and a distribution over scaled returns; two updates per step.",
+        SCALED_RETURNS
+        | {
+            "network": "batch_norm_mlp",
+            "hidden_layers": (256, 256, 256, 256),
+            "critic_hidden_layers": (512, 512, 512, 512),
+            "joint_forward": True,
+            "weight_projection": "unit_columns",
+            "discount": 0.995,
+            "learning_rate_schedule": "linear",
+            "final_learning_rate_share": 0.1,
+            "actor_interval": 3,
+            "updates_per_interval": 2,
+            "update_interval": 1,
+            "random_steps": 5_000,
+            "reward_scaling": "deviation",
+            "target_entropy_per_action": -0.5,
+        },
+        source="Palenicek et al. 2025",
     ),
 }
 

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from saclab.algorithm.networks import NETWORKS
-from saclab.algorithm.networks.batch_norm_mlp import EPSILON, MOMENTUM, batch_norm_mlp, normalise
+from saclab.algorithm.networks.batch_norm_mlp import (
+    EPSILON,
+    MOMENTUM,
+    WARM_UPDATES,
+    batch_norm_mlp,
+    normalise,
+    renormalised_moments,
+)
 from saclab.algorithm.networks.layer_norm_mlp import dropped_out
 from saclab.algorithm.networks.network import ACTIVATIONS, INITIALISATIONS, Design
 
@@ -193,3 +200,12 @@ def test_xavier_weights_are_uniform_up_to_their_bound_and_biases_zero():
     assert np.abs(weights).max() == pytest.approx(0.1, rel=1e-3)  # √(6 / 600)
     assert weights.std() == pytest.approx(0.1 / 3**0.5, rel=0.02)
     assert not bias.any()
+
+
+@pytest.mark.parametrize(("updates", "expected"), [(WARM_UPDATES - 1, 0.9999), (WARM_UPDATES, 2.997)])
+def test_batch_renormalisation_by_hand(updates, expected):
+    """A batch of mean 1 and variance 4, running moments of 0 and 1: x = 3 comes out as 3 once they have settled."""
+    moments = [jnp.array([1.0]), jnp.array([4.0])]
+    mean, variance = renormalised_moments(*moments, jnp.array([[0.0], [1.0]]), [jnp.array([float(updates)])])
+    normal = normalise(jnp.array([[3.0]]), mean, variance, jnp.ones(1), jnp.zeros(1))
+    np.testing.assert_allclose(normal, [[expected]], atol=5e-4)

@@ -2,56 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from resume.helpers import finish, small_config, stop_at
 
 from saclab.training.checkpoint import newest_first
 
+from .conftest import Told
+
 TRAIN = ("--hidden-layers", "8", "--batch-size", "16", "--random-steps", "40", "--max-steps", "60",
          "--evaluation-episodes", "1")  # fmt: skip
 STOPPED = 130
 
 
-class Told(NamedTuple):
-    status: int
-    output: str
-    errors: str
-
-    def is_one_line(self, status: int, words: str) -> None:
-        assert "Traceback" not in self.output + self.errors, self
-        assert (self.status, self.errors.count("\n")) == (status, 1), self
-        assert re.search(words, self.errors), self
-
-
-@pytest.fixture(scope="module")
-def saclab() -> Iterator[Callable[..., Told]]:
-    """Run a command in a process that permissions bind."""
-    process = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("confined.py"))],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stdin is not None
-    assert process.stdout is not None
-    if not json.loads(process.stdout.readline()):
-        process.communicate()
-        pytest.skip("this process may read everything, and cannot give up the right to")
-
-    def run(*arguments: str | Path) -> Told:
-        print(json.dumps([str(word) for word in arguments]), file=process.stdin, flush=True)
-        return Told(**json.loads(process.stdout.readline()))
-
-    yield run
-    process.communicate()
-    assert process.returncode == 0
+def is_one_line(told: Told, status: int, words: str) -> None:
+    assert "Traceback" not in told.output + told.errors, told
+    assert (told.status, told.errors.count("\n")) == (status, 1), told
+    assert re.search(words, told.errors), told
 
 
 @pytest.fixture(scope="module")
@@ -77,42 +48,44 @@ UNREADABLE = ("config.json", "evaluations.csv", "metrics.jsonl", "episodes.csv",
 
 
 @pytest.mark.parametrize("name", UNREADABLE)
-def test_an_unreadable_run_is_told_of_by_a_report(saclab, runs, tmp_path, name):
+def test_an_unreadable_run_is_told_of_by_a_report(saclab_confined, runs, tmp_path, name):
     (runs / "finished" / name).chmod(0)
-    saclab("report", runs / "finished", "--out", tmp_path / "alone").is_one_line(2, "Permission denied")
-    strict = saclab("report", runs, "--out", tmp_path / "strict", "--strict")
-    strict.is_one_line(2, "1 of 2 folders cannot be read: .*Permission denied")
+    is_one_line(saclab_confined("report", runs / "finished", "--out", tmp_path / "alone"), 2, "Permission denied")
+    strict = saclab_confined("report", runs, "--out", tmp_path / "strict", "--strict")
+    is_one_line(strict, 2, "1 of 2 folders cannot be read: .*Permission denied")
 
 
-def test_an_unreadable_run_is_left_out_of_a_report(saclab, runs, tmp_path):
+def test_an_unreadable_run_is_left_out_of_a_report(saclab_confined, runs, tmp_path):
     (runs / "finished").chmod(0)
     (runs / "stopped/evaluations.csv").chmod(0o444)
-    told = saclab("report", runs, "--out", tmp_path / "report")
+    told = saclab_confined("report", runs, "--out", tmp_path / "report")
     assert (told.status, told.errors) == (0, ""), told
     assert re.search(r"left out: .*finished.*Permission denied", told.output)
 
 
 @pytest.mark.parametrize("name", ["report", "report/index.html", "report/figures"])
-def test_a_report_into_a_place_without_permission_is_one_line(saclab, runs, tmp_path, name):
+def test_a_report_into_a_place_without_permission_is_one_line(saclab_confined, runs, tmp_path, name):
     out, place = tmp_path / "report", tmp_path / name
     (out / "figures").mkdir(parents=True)
     (out / "index.html").write_text("")
     place.chmod(0o555 if place.is_dir() else 0o444)
-    saclab("report", runs / "finished", "--out", out).is_one_line(
-        2, "cannot write the report to .*Permission denied.*--out"
+    is_one_line(
+        saclab_confined("report", runs / "finished", "--out", out),
+        2,
+        "cannot write the report to .*Permission denied.*--out",
     )
 
 
 @pytest.mark.parametrize("name", ["best/policy.json", "best/policy.safetensors", "best", ""])
 @pytest.mark.parametrize("command", ["evaluate", "record"])
-def test_an_unreadable_policy_is_one_line(saclab, runs, command, name):
+def test_an_unreadable_policy_is_one_line(saclab_confined, runs, command, name):
     (runs / "finished" / name).chmod(0)
-    saclab(command, runs / "finished").is_one_line(2, "Permission denied")
+    is_one_line(saclab_confined(command, runs / "finished"), 2, "Permission denied")
 
 
-def test_a_film_without_permission_is_one_line(saclab, runs):
+def test_a_film_without_permission_is_one_line(saclab_confined, runs):
     (runs / "finished/best").chmod(0o555)
-    saclab("record", runs / "finished", "--steps", "2").is_one_line(2, "Permission denied")
+    is_one_line(saclab_confined("record", runs / "finished", "--steps", "2"), 2, "Permission denied")
 
 
 UNWRITABLE = {
@@ -130,33 +103,33 @@ HIDDEN = {
     [pytest.param(*case, id=f"{kind} {what}") for kind, cases in (("read-only", UNWRITABLE), ("hidden", HIDDEN))
      for what, case in cases.items()],
 )  # fmt: skip
-def test_a_resume_without_permission_loses_nothing(saclab, runs, name, mode, status):
+def test_a_resume_without_permission_loses_nothing(saclab_confined, runs, name, mode, status):
     """It ends with a line, and goes on where it was once it may."""
     run = runs / "stopped"
     (run / name).chmod(mode)
-    saclab("resume", run).is_one_line(status, "Permission denied")
+    is_one_line(saclab_confined("resume", run), status, "Permission denied")
     for path in (run, run / name):
         path.chmod(0o755)
     newest = newest_first(run / "checkpoints")[0].name
-    told = saclab("resume", run)
+    told = saclab_confined("resume", run)
     assert told.status == 0, told
     assert f"resumed at step {int(newest.split('-')[1])}" in told.output
     assert int(newest.split("-")[1]) >= STOPPED
 
 
-def test_an_unreadable_checkpoint_is_passed_over(saclab, runs):
+def test_an_unreadable_checkpoint_is_passed_over(saclab_confined, runs):
     (newest_first(runs / "stopped/checkpoints")[0] / "learner.safetensors").chmod(0)
-    told = saclab("resume", runs / "stopped")
+    told = saclab_confined("resume", runs / "stopped")
     assert told.status == 0, told
     assert "resumed at step 100" in told.output
     assert re.search(r"is damaged: learner\.safetensors.*Permission denied", told.output)
 
 
 @pytest.mark.parametrize("command", ["train", "compare"])
-def test_runs_in_a_place_without_permission_are_one_line(saclab, tmp_path, command):
+def test_runs_in_a_place_without_permission_are_one_line(saclab_confined, tmp_path, command):
     place = tmp_path / "closed"
     place.mkdir(mode=0o555)
-    told = saclab(command, "Pendulum-v1", *TRAIN, "--runs", place / "runs")
+    told = saclab_confined(command, "Pendulum-v1", *TRAIN, "--runs", place / "runs")
     assert told.status in (1, 2)
-    told.is_one_line(told.status, f"{place}.*Permission denied")
+    is_one_line(told, told.status, f"{place}.*Permission denied")
     assert not list(place.iterdir())

@@ -7,7 +7,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
-from conftest import ACTION_SIZE, MORE_CASES, OBSERVATION_SIZE, VARIANT_CASES, make_case
+from conftest import ACTION_SIZE, MORE_CASES, OBSERVATION_SIZE, VARIANT_CASES, as_parameters, make_case
 
 from . import numpy_layer_norm
 from .numpy_sac import Draws, Layers, NumpySac, backward, forward
@@ -143,7 +143,7 @@ def assert_same_update(case) -> None:
             assert_close(value, expected[name], f"{name} {where}")
 
 
-@pytest.mark.parametrize("name", [name for name, settings in ALL_CASES.items() if known(settings)])
+@pytest.mark.parametrize("name", as_parameters({name: case for name, case in ALL_CASES.items() if known(case)}))
 def test_the_composed_update_equals_the_reference(name):
     assert_same_update(make_case(ALL_CASES[name]))
 

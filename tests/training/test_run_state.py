@@ -10,6 +10,7 @@ import pytest
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError
 from saclab.protocols import make_config
+from saclab.replay import RowLayout
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.run_state import RunState
 from saclab.training.saved_state import Counters
@@ -19,7 +20,7 @@ from saclab.training.saved_state import Counters
 def run():
     return RunState(make_config("Counting-v0", "sac", overrides={
         "batch_size": 4, "random_steps": 12, "max_steps": 60, "evaluation_interval_steps": 7, "evaluation_episodes": 2,
-    }), action_size=1)  # fmt: skip
+    }), RowLayout(1, 1))  # fmt: skip
 
 
 def with_settings(run: RunState, **changes) -> None:

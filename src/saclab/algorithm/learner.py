@@ -14,6 +14,7 @@ from saclab.algorithm.losses import actor_loss, temperature_loss
 from saclab.algorithm.metrics import METRICS
 from saclab.algorithm.networks import critic_network
 from saclab.algorithm.networks.network import Array, Network
+from saclab.algorithm.networks.normalised_inputs import with_moments
 from saclab.algorithm.optimizer import Trainer, descend
 from saclab.algorithm.policy import Policy, make_policy
 from saclab.algorithm.scalars import Scalars
@@ -127,12 +128,28 @@ def init(parts: Parts, numbers: Scalars, key: jax.Array) -> LearnerState:
 def update(parts: Parts, numbers: Scalars, state: LearnerState, batch: Batch, context: Context) -> LearnerState:
     """One update of everything, in the variant's order: critic, actor, temperature, targets, unless it says another."""
     key = jax.random.fold_in(state.key, context.step)
+    state = take_moments(state, batch, context)
     found = {"temperature": jnp.exp(state.temperature.weights), "reward_scale": context.reward_scale}
     names = metric_names(parts.settings)
     state = state._replace(report={name: found.get(name, state.report[place]) for place, name in enumerate(names)})
     for name in parts.settings.update_order:
         state = UPDATES[name](parts, numbers, state, batch, context, key)
     return state._replace(report=jnp.stack([state.report[name] for name in names]))
+
+
+def take_moments(state: LearnerState, batch: Batch, context: Context) -> LearnerState:
+    """`state` with networks that normalise observations by the run's present moments, where any does."""
+    if context.observation_moments is None:
+        return state
+    of_policy = batch.observation.shape[1]
+    of_critic = of_policy + batch.action.shape[1]
+    actor = with_moments(state.actor.weights, of_policy, context.observation_moments)
+    critic = with_moments(state.critic.weights, of_critic, context.observation_moments)
+    return state._replace(
+        actor=state.actor._replace(weights=actor),
+        critic=state.critic._replace(weights=critic),
+        targets=with_moments(state.targets, of_critic, context.observation_moments),
+    )
 
 
 FOR_NETWORKS = 1  # folded into the key of a noise, it is that of the networks that draw something while they learn

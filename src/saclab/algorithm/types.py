@@ -34,6 +34,8 @@ class Context(NamedTuple):
     """f32[T]."""
     reward_scale: jax.Array | np.float32
     """f32[]: rewards are divided by it."""
+    observation_moments: jax.Array | np.ndarray | None = None
+    """f32[2, O]: mean and deviation by which observations are normalised; None where they are not."""
 
 
 class Trained(NamedTuple):

@@ -64,6 +64,7 @@ class DeviceEngine:
         self.numbers = self._put_stacked([numbers_of(config, replay.layout) for config in configs])
         self.reward_weights = self._put_stacked([reward_weights(config.algorithm) for config in configs])
         self.reward_scale = self._put_stacked([run.reward_scale.value for run in self.runs])
+        self.observation_moments = self._put_stacked([run.observation_moments.value for run in self.runs])
         self.state: LearnerState = self._put_stacked([start.learner for start in starts])
         self.actor_before: jax.Array | None = None
         if all(start.behaviour is not None for start in starts):
@@ -236,7 +237,9 @@ class DeviceEngine:
         return self.actor_before
 
     def _advance(self, updates: int, packed: jax.Array) -> None:
-        context = Context(np.int32(self.updates - updates), self.reward_weights, self.reward_scale)
+        context = Context(
+            np.int32(self.updates - updates), self.reward_weights, self.reward_scale, self.observation_moments
+        )
         self.state, self.replay.rows, metrics = self.program.advance(
             updates, self.numbers, self.state, self.replay.rows, packed, context
         )
@@ -251,6 +254,7 @@ class DeviceEngine:
         before = self.steps - training.parallel_environments
         position = np.full(len(runs), before % training.replay_capacity, np.int32)
         self._scale_rewards(rows, runs)
+        self._enter_observations(rows, runs)
         self.experience = Experience(rows, position, self._draw(runs))
 
     def _draw(self, runs: Sequence[RunState | None]) -> np.ndarray:
@@ -282,6 +286,15 @@ class DeviceEngine:
                 terms = self.replay.layout.unpack(rows[place]).reward_terms
                 run.reward_scale.enter(np.asarray(terms) @ reward_weights(run.config.algorithm), ended[place])
         self.reward_scale = self._put_stacked([run.reward_scale.value for run in self.runs])
+
+    def _enter_observations(self, rows: np.ndarray, runs: Sequence[RunState | None]) -> None:
+        """Let the running moments take in the observations of rows f32[runs, E, width], where any are normalised."""
+        if not self.runs[0].observation_moments.active:
+            return
+        for place, run in enumerate(runs):
+            if run is not None:
+                run.observation_moments.enter(np.asarray(self.replay.layout.unpack(rows[place]).observation))
+        self.observation_moments = self._put_stacked([run.observation_moments.value for run in self.runs])
 
     def _put_stacked(self, trees: Sequence[Any]) -> Any:
         """One tree per run as one tree on the devices; the slots without a run are like the first one's."""

@@ -127,7 +127,9 @@ class Program:
                 state = LearnerState(**others | {"actor": Trained(actor, others["actor"])})
                 return self._advance_slot(updates, numbers, state, replay, packed, context)
 
-            specs = (RUNS, RUNS, RUNS, RUNS, RUNS, Context(step=SHARED, reward_weights=RUNS, reward_scale=RUNS))
+            moments = None if context.observation_moments is None else RUNS
+            of_context = Context(SHARED, reward_weights=RUNS, reward_scale=RUNS, observation_moments=moments)
+            specs = (RUNS, RUNS, RUNS, RUNS, RUNS, of_context)
             self._advance[updates] = self._mapped(advance, specs, donated=(2, 3))
         actor, others = state.actor.weights, state._asdict() | {"actor": state.actor.moments}
         result: tuple[LearnerState, jax.Array, jax.Array] = self._advance[updates](

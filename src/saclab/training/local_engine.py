@@ -72,7 +72,9 @@ class LocalEngine:
         self.update = compiled_update(structure(config.algorithm), replay.layout)
         self.numbers = on_device(numbers_of(config, replay.layout))
         self.reward_weights = reward_weights(config.algorithm)
-        self.context = on_device(Context(np.int32(0), self.reward_weights, self.run.reward_scale.value))
+        self.context = on_device(
+            Context(np.int32(0), self.reward_weights, self.run.reward_scale.value, self.run.observation_moments.value)
+        )
         self.learner_state = on_device(start.learner)
         self._actor: np.ndarray | None = None
         self._actor_before = start.behaviour
@@ -94,6 +96,9 @@ class LocalEngine:
             last = np.isin(np.arange(len(self.environments)), [episode.environment for episode in ended])
             run.reward_scale.enter(transitions.reward_terms @ self.reward_weights, last)
             self.context = self.context._replace(reward_scale=run.reward_scale.value)
+        if run.observation_moments.active:
+            run.observation_moments.enter(transitions.observation)
+            self.context = self.context._replace(observation_moments=run.observation_moments.value)
         counters.steps += len(self.environments)
         if run.updates_left:
             self._actor_before = self.actor(0)

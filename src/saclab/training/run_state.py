@@ -10,10 +10,12 @@ from saclab.algorithm.learner import metric_names
 from saclab.config import Config
 from saclab.environments.vector import EndedEpisode
 from saclab.errors import NonFiniteError
+from saclab.replay import RowLayout
 from saclab.training import seeds
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.exploration import Exploration
 from saclab.training.manifest import Moment
+from saclab.training.observation_moments import ObservationMoments
 from saclab.training.reward_scale import RewardScale
 from saclab.training.saved_state import Counters
 
@@ -24,14 +26,15 @@ EVALUATE_FIRST = -1  # for `evaluation_slots`: an evaluation is due before the n
 class RunState:
     """A run's settings, counters, generators, open window of metrics and best policy."""
 
-    def __init__(self, config: Config, action_size: int) -> None:
+    def __init__(self, config: Config, layout: RowLayout) -> None:
         """The state before the first step."""
         self.config = config
         algorithm, environments = config.algorithm, config.training.parallel_environments
-        self.exploration = Exploration(config.seed, environments, action_size, algorithm.longest_noise)
+        self.exploration = Exploration(config.seed, environments, layout.action_size, algorithm.longest_noise)
         self.reward_scale = RewardScale(
             algorithm.reward_scaling, environments, algorithm.discount, algorithm.critic_bound
         )
+        self.observation_moments = ObservationMoments(algorithm.observation_normalisation, layout.observation_size)
         self.metrics = metric_names(algorithm)
         """Names of what an update reports."""
         self.sampling = seeds.generator(config.seed, "replay")

@@ -53,7 +53,7 @@ class Snapshot(NamedTuple):
 
 def new_start(config: Config, layout: RowLayout) -> Start:
     """A run before its first step."""
-    return Start(RunState(config, layout.action_size), initial_learner(config, layout))
+    return Start(RunState(config, layout), initial_learner(config, layout))
 
 
 def to_checkpoint(
@@ -87,6 +87,7 @@ def to_checkpoint(
         groups["acting"] = {"actor": snapshot.behaviour}
     noise, groups["exploration"] = run.exploration.capture()
     groups["rewards"] = run.reward_scale.capture()
+    groups["observations"] = run.observation_moments.capture()
     state = SavedState(
         run.counters, environment_states, msgspec.convert(noise, GeneratorState),
         msgspec.convert(run.sampling.bit_generator.state, GeneratorState), logs or {},
@@ -108,7 +109,7 @@ def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -
     behaviour = None
     if config.training.acting_delay:
         behaviour = require_like("acting", groups.get("acting", {}).get("actor"), np.asarray(example.actor.weights))
-    run = RunState(config, layout.action_size)
+    run = RunState(config, layout)
     window = groups.get("window", {}).get("metrics", np.zeros(0))
     run.window = list(require_like("metrics", window, np.zeros((*window.shape[:1], len(run.metrics)), np.float32)))
     if "best" in groups:
@@ -119,6 +120,7 @@ def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -
         raise CheckpointError(f"the checkpoint has {run.counters.steps} steps and {checkpoint.transitions} transitions")
     run.exploration.restore(msgspec.to_builtins(state.exploration), groups.get("exploration", {}))
     run.reward_scale.restore(groups.get("rewards", {}))
+    run.observation_moments.restore(groups.get("observations", {}))
     restore_generator("sampling", run.sampling, msgspec.to_builtins(state.sampling))
     like = np.zeros((config.training.parallel_environments, layout.observation_size), np.float32)
     environments = join_arrays(groups.get("environments", {}), state.environments, like)

@@ -33,6 +33,25 @@ def test_a_variant_may_set_how_a_run_is_trained(row):
     assert variant_settings("mine", "Humanoid-v4") == variant_settings("sac", "Humanoid-v4")
 
 
+@pytest.mark.parametrize(
+    ("environment", "entropy", "dropout", "dropped"),
+    [
+        ("Hopper-v4", -1, 0.0001, 5),
+        ("HalfCheetah-v4", -3, 0.01, 0),
+        ("Walker2d-v4", -3, 0.005, 2),
+        ("Humanoid-v4", -2, 0.1, 2),
+        ("Pendulum-v1", None, 0.01, 2),
+    ],
+)
+def test_redq_droq_and_tqc_follow_their_authors_by_environment(environment, entropy, dropout, dropped):
+    for variant in ("redq", "droq"):
+        config = make_config(environment, variant, "standard")
+        assert (config.algorithm.target_entropy, config.algorithm.actor_interval) == (entropy, 20)
+        assert (config.training.update_to_data_ratio, config.training.random_steps) == (20, 5000)
+    assert config.algorithm.critic_dropout == dropout
+    assert variant_settings("tqc", environment).dropped_quantiles == dropped
+
+
 def test_a_quick_run_of_a_dear_variant_is_held_to_what_takes_minutes(row):
     dear = {"batch_size": 512, "critic_hidden_layers": (2048, 128), "actor_interval": 2, "updates_per_interval": 20}
     row(**dear)

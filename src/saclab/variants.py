@@ -57,6 +57,8 @@ SCALED_RETURNS = {
 """What XQC, SimbaV2 and FlashSAC share: a distribution over returns that scaled rewards hold within bounds."""
 ENSEMBLE_ENTROPY = {"Hopper-": -1.0, "HalfCheetah-": -3.0, "Walker2d-": -3.0, "Ant-": -4.0, "Humanoid-": -2.0}
 """Target entropies of MBPO, REDQ and DroQ."""
+DROPOUT = {"Hopper-": 0.0001, "Walker2d-": 0.005, "Humanoid-": 0.1}
+"""DroQ's rates of dropout, where they differ from 0.01."""
 
 COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
 """The variants of a comparison, unless others are asked for."""
@@ -102,8 +104,10 @@ VARIANTS: dict[str, Variant] = {
         "DroQ",
         "REDQ with two critics that have dropout and layer normalisation.",
         ENSEMBLE | {"critic_network": "layer_norm_mlp", "critic_dropout": 0.01, "critic_mode_for_actor": "training"},
-        {prefix: {"target_entropy": entropy} for prefix, entropy in ENSEMBLE_ENTROPY.items()}
-        | {"Humanoid-": {"target_entropy": -2.0, "critic_dropout": 0.1}},
+        {
+            prefix: {"target_entropy": entropy, "critic_dropout": DROPOUT.get(prefix, 0.01)}
+            for prefix, entropy in ENSEMBLE_ENTROPY.items()
+        },
         source="Hiraoka et al. 2022",
     ),
     "tqc": Variant(

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 from conftest import context
 
+from saclab.algorithm.learner import Parts
+from saclab.settings import AlgorithmSettings
+
 
 def named(tree) -> dict[str, np.ndarray]:
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
@@ -215,6 +218,15 @@ def test_the_reward_is_the_weighted_sum_of_its_terms_over_the_scale(case_of):
     ours = case.compiled(case.numbers, state, batch._replace(reward_terms=terms), weighted)
     same = batch._replace(reward_terms=(batch.reward_terms * (1 - 0.5) + 3) / 0.5)
     np.testing.assert_allclose(ours.report, case.update(state, same, 0).report, rtol=1e-5)
+
+
+def test_each_pair_of_three_critics_values_the_next_state_equally_often():
+    settings = AlgorithmSettings(critics=3, target_critics=2)
+    parts = Parts._make([settings] + [None] * (len(Parts._fields) - 1))
+    pairs = np.asarray(jax.vmap(parts.chosen_critics)(jax.random.split(jax.random.PRNGKey(0), 3000)))
+    smaller = np.array([5.0, 1.0, 3.0])[pairs].min(axis=1)
+    assert smaller.mean() == pytest.approx(5 / 3, abs=0.07)  # 1 of two pairs, 3 of one; four standard deviations
+    assert {tuple(sorted(pair)) for pair in pairs.tolist()} == {(0, 1), (0, 2), (1, 2)}
 
 
 def test_a_policy_that_learns_jointly_normalises_by_both_states(case_of):

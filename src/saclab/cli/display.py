@@ -16,7 +16,7 @@ from rich.table import Table
 from saclab.api import Comparison
 from saclab.grid.rate import RateMeter
 from saclab.grid.tasks import RunStatus
-from saclab.settings import TrainingSettings
+from saclab.protocols import Protocol
 from saclab.signals import EXIT_STATUS
 from saclab.training import events
 from saclab.variants import Variant
@@ -185,6 +185,7 @@ def variants_table(variants: Mapping[str, Variant]) -> Table:
     return table
 
 
-def changed_settings(settings: TrainingSettings) -> dict[str, Any]:
-    """The settings of a protocol that are set."""
-    return {name: value for name, value in dataclasses.asdict(settings).items() if value is not None}
+def settings_of(protocol: Protocol) -> dict[str, Any]:
+    """What a protocol sets, by name, and what it holds a variant to."""
+    of_training = {name: value for name, value in dataclasses.asdict(protocol.settings).items() if value is not None}
+    return of_training | protocol.algorithm | {f"{name} at most": most for name, most in protocol.ceilings.items()}

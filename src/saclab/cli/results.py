@@ -118,6 +118,6 @@ class Protocols:
     def __call__(self, console: Console) -> int:
         from saclab.cli import display
 
-        rows = {name: (row.description, display.changed_settings(row.settings)) for name, row in PROTOCOLS.items()}
+        rows = {name: (row.description, display.settings_of(row)) for name, row in PROTOCOLS.items()}
         console.print(display.catalogue(rows))
         return 0

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from saclab.config import Config
 from saclab.errors import UserError
 from saclab.machine import SIMULATION_PACKAGES, major
-from saclab.protocols import PROTOCOLS, make_config, protocol_settings, split_settings
+from saclab.protocols import PROTOCOLS, make_config, training_settings
 from saclab.report.text import shown
 from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord, safe_name
@@ -109,8 +109,9 @@ def own_training(config: Config) -> TrainingSettings | None:
     """
     if config.protocol not in PROTOCOLS:
         return None
-    row = VARIANTS[config.variant].settings if config.variant in VARIANTS else {}
-    return TrainingSettings(**split_settings(protocol_settings(config.protocol, config.environment) | row)[1])
+    if config.variant not in VARIANTS:
+        return training_settings(config.protocol, config.environment)
+    return make_config(config.environment, config.variant, config.protocol).training
 
 
 def beside_variant(config: Config) -> dict[str, Any]:

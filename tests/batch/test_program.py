@@ -27,7 +27,13 @@ def stacked(trees):
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
 
 
-@pytest.mark.parametrize("changes", [{"snapshots": 1}, {"snapshots": 3}, *LEARNING.values()])
+EACH = {"one snapshot": {"snapshots": 1}, "three snapshots": {"snapshots": 3}} | LEARNING
+FAST = "three snapshots", "three steps"
+
+
+@pytest.mark.parametrize(
+    "changes", [pytest.param(EACH[name], id=name, marks=[] if name in FAST else pytest.mark.slow) for name in EACH]
+)
 def test_each_slot_is_updated_by_its_own_numbers(changes):
     """Fixed and learned α, γ, τ, learning rates and the snapshot interval differ; rows are stored, then drawn."""
     settings = [each.algorithm for each in mixed(batch_size=16, **changes)]

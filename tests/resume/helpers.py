@@ -23,6 +23,7 @@ from saclab.training.engine import StepResult
 from saclab.training.events import Event, Finished, Interrupted, Saved, UpdatesLogged
 from saclab.training.local_engine import LocalEngine
 from saclab.training.requests import Requests
+from saclab.variants import variant_changes
 
 STEPS = 240
 SMALL = {
@@ -40,6 +41,8 @@ SMALL = {
 
 def small_config(environment: str, variant: str = "averaged-auto", environments: int = 1, **changes: object) -> Config:
     overrides = {**SMALL, "parallel_environments": environments, **changes}
+    if "critic_hidden_layers" in variant_changes(variant, environment):
+        overrides = {"critic_hidden_layers": (16, 16), **overrides}
     return make_config(environment, variant, "standard", seed=5, overrides=overrides)
 
 
@@ -78,7 +81,7 @@ def vanish_after(step: int, config: Config, folder: Path) -> None:
     with request_at(step, requests, "save"), closing(loop.train(config, folder, requests)) as events:
         for event in events:
             saved = saved or isinstance(event, Saved)
-            if saved and isinstance(event, UpdatesLogged):
+            if saved and isinstance(event, UpdatesLogged) and event.steps > step:
                 break
     assert event.steps > step
     assert not (folder / "result.json").exists()

@@ -117,7 +117,7 @@ def assert_same_update(case) -> None:
     reference = reference_of(case, state)
     for step in range(UPDATES):
         batch = case.batch(generator)
-        columns = [np.asarray(column, np.float64) for column in batch]
+        columns = [np.asarray(column, np.float64) for column in batch if column is not None]
         columns[2] = columns[2][:, 0]  # one term: the reward
         drawn = draws(state, step, case.settings)
         state = case.update(state, batch, step)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import context
+from conftest import VARIANT_CASES, context
 
 from saclab.algorithm.learner import Parts
 from saclab.settings import AlgorithmSettings
@@ -121,8 +121,15 @@ def test_another_key_or_another_step_draws_other_noise(case_of):
     assert len({case.report(case.update(start, batch, step))["entropy"] for start, step in draws}) == 3
 
 
-def test_scanned_and_side_by_side_it_equals_repeated_calls(variant):
+SCANNED = "averaged-auto/mlp", "droq/layer_norm_mlp"
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in SCANNED else pytest.mark.slow) for name in VARIANT_CASES]
+)
+def test_scanned_and_side_by_side_it_equals_repeated_calls(case_of, name):
     """Three learners, vmapped over a scan of three updates, against three loops."""
+    variant = case_of(name)
     runs = [after(variant, 3, seed) for seed in range(3)]
     generators = [np.random.default_rng(seed) for seed in range(3)]
     batches = [jax.tree.map(lambda *x: np.stack(x), *[variant.batch(g) for _ in range(3)]) for g in generators]

@@ -16,6 +16,7 @@ class Policy(NamedTuple):
     network: Network
     log_std_minimum: float
     log_std_maximum: float
+    log_std_bounding: str = "clip"
 
     def distribution(self, parameters: Array, observation: Array) -> tuple[Array, Array]:
         """Mean and log standard deviation before the tanh: two f32[..., A] for f32[..., O]."""
@@ -24,7 +25,11 @@ class Policy(NamedTuple):
     def _distribution(self, output: Array) -> tuple[Array, Array]:
         xp = output.__array_namespace__()
         size = output.shape[-1] // 2
-        return output[..., :size], xp.clip(output[..., size:], self.log_std_minimum, self.log_std_maximum)
+        mean, raw = output[..., :size], output[..., size:]
+        lowest, highest = self.log_std_minimum, self.log_std_maximum
+        if self.log_std_bounding == "tanh":
+            return mean, lowest + 0.5 * (highest - lowest) * (1 + xp.tanh(raw))
+        return mean, xp.clip(raw, lowest, highest)
 
     def mode(self, parameters: Array, observation: Array) -> Array:
         """The deterministic action, tanh of the mean: f32[..., A] in [-1, 1]."""
@@ -67,4 +72,4 @@ def squash(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
 def make_policy(settings: AlgorithmSettings, observation_size: int, action_size: int) -> Policy:
     """The policy for observations f32[..., observation_size] and actions f32[..., action_size]."""
     network = policy_network(settings, observation_size, 2 * action_size)
-    return Policy(network, settings.log_std_minimum, settings.log_std_maximum)
+    return Policy(network, settings.log_std_minimum, settings.log_std_maximum, settings.log_std_bounding)

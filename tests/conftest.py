@@ -58,6 +58,8 @@ def variant_case(variant: str) -> AlgorithmSettings:
         "critic_dropout": 0.25 if own.critic_dropout else 0.0,
         "actor_interval": min(own.actor_interval, 3),
     }
+    if own.network in ("batch_norm_residual", "hyperspherical"):  # of one width
+        small |= {"critic_hidden_layers": (6, 6), "hidden_layers": (8, 8)[: len(own.hidden_layers)]}
     return dataclasses.replace(own, **small)
 
 

@@ -12,6 +12,7 @@ from saclab.algorithm.networks import NETWORKS
 from saclab.algorithm.networks.network import ACTIVATIONS, INITIALISATIONS, PROJECTIONS
 from saclab.algorithm.networks.normalised_inputs import INPUT_NORMALISATIONS
 from saclab.algorithm.optimizer import SCHEDULES
+from saclab.algorithm.policy import BOUNDINGS
 from saclab.algorithm.scalars import ELSEWHERE, pack, scalars, unpack
 from saclab.algorithm.targets import REDUCTIONS, TARGET_REDUCTIONS
 from saclab.errors import SettingError
@@ -30,6 +31,7 @@ TABLES = {
     "temperature_gradient": FACTORS,
     "weight_projection": PROJECTIONS,
     "initialisation": INITIALISATIONS,
+    "log_std_bounding": BOUNDINGS,
     "observation_normalisation": INPUT_NORMALISATIONS,
     "reward_scaling": SCALES,
 }

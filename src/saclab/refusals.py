@@ -87,6 +87,7 @@ def require_possible(settings: AlgorithmSettings) -> None:
         "reward_weights", " ".join(map(str, settings.reward_weights)),
         f"give one for each of the {len(settings.reward_terms)} reward_terms, or none",
     )  # fmt: skip
+    require_possible_layers(settings)
     require_possible_critics(settings)
     order = settings.update_order
     require(
@@ -94,6 +95,17 @@ def require_possible(settings: AlgorithmSettings) -> None:
         "update_order", " ".join(order),
         f"name each of {', '.join(UPDATES)} once, and actor before temperature, which is judged by its entropy",
     )  # fmt: skip
+
+
+def require_possible_layers(settings: AlgorithmSettings) -> None:
+    """Raise SettingError for layers that a network cannot have."""
+    for network, name in ((settings.network, "hidden_layers"), (settings.network_of_critic, "critic_hidden_layers")):
+        layers = settings.hidden_layers if name == "hidden_layers" else settings.layers_of_critic
+        require(
+            network not in ("batch_norm_residual", "hyperspherical") or len(set(layers)) == 1,
+            name, " ".join(map(str, layers)), f"use one width for all: what goes into a block of {network} is added to "
+            "what comes out",
+        )  # fmt: skip
 
 
 def require_possible_critics(settings: AlgorithmSettings) -> None:

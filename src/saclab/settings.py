@@ -26,7 +26,9 @@ such settings only can be trained as one run group."""
 Whole = Annotated[int, PLAIN_NUMBER]
 
 Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
-NetworkName = Literal["mlp", "layer_norm_mlp", "batch_norm_mlp", "batch_renorm_mlp"]
+NetworkName = Literal[
+    "mlp", "layer_norm_mlp", "batch_norm_mlp", "batch_renorm_mlp", "batch_norm_residual", "hyperspherical"
+]  # fmt: skip
 Reduction = Literal["minimum", "mean"]
 
 
@@ -66,7 +68,7 @@ class AlgorithmSettings:
     """How the weights start: as each network has it, or Xavier-uniform with biases of zero."""
     weight_projection: Literal["none", "unit_columns"] = "none"
     """What is done to the weight matrices after each step: nothing, or the weights into each unit are scaled to
-    length 1."""
+    length 1; in a `batch_norm_residual` the scales and biases of each normalisation too, to a mean square of 1."""
     critics: int = 2
     """Q-networks that are trained side by side."""
     critic_dropout: float = 0.0
@@ -128,9 +130,11 @@ class AlgorithmSettings:
     target_entropy_per_action: Real = -1.0
     """Target entropy for each dimension of the action, in nats, if `target_entropy` gives none for all together."""
     log_std_minimum: float = -20.0
-    """Lower clip of the policy's log standard deviation."""
+    """Lower bound of the policy's log standard deviation."""
     log_std_maximum: float = 2.0
-    """Upper clip of the policy's log standard deviation."""
+    """Upper bound of the policy's log standard deviation."""
+    log_std_bounding: Literal["clip", "tanh"] = "clip"
+    """How the policy's log standard deviation is held between its bounds: clipped, or by a tanh that spans them."""
 
     longest_noise: int = 1
     """Most steps for which one draw of the exploration noise is held; how many, n, is drawn with a probability

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 from saclab.algorithm.networks import policy_network
@@ -16,15 +17,16 @@ class Policy(NamedTuple):
     network: Network
     log_std_minimum: float
     log_std_maximum: float
+    bounded: Callable[[Array, float, float], Array]
+    """One of BOUNDINGS."""
 
     def distribution(self, parameters: Array, observation: Array) -> tuple[Array, Array]:
         """Mean and log standard deviation before the tanh: two f32[..., A] for f32[..., O]."""
         return self._distribution(self.network.apply(parameters, observation))
 
     def _distribution(self, output: Array) -> tuple[Array, Array]:
-        xp = output.__array_namespace__()
         size = output.shape[-1] // 2
-        return output[..., :size], xp.clip(output[..., size:], self.log_std_minimum, self.log_std_maximum)
+        return output[..., :size], self.bounded(output[..., size:], self.log_std_minimum, self.log_std_maximum)
 
     def mode(self, parameters: Array, observation: Array) -> Array:
         """The deterministic action, tanh of the mean: f32[..., A] in [-1, 1]."""
@@ -51,6 +53,19 @@ class Policy(NamedTuple):
         return *squash(*self._distribution(output[: len(noise)]), noise), statistics
 
 
+def clipped(raw: Array, lowest: float, highest: float) -> Array:
+    return raw.__array_namespace__().clip(raw, lowest, highest)
+
+
+def spanned(raw: Array, lowest: float, highest: float) -> Array:
+    """Between the bounds by a tanh; 0 lies in their middle."""
+    return lowest + 0.5 * (highest - lowest) * (1 + raw.__array_namespace__().tanh(raw))
+
+
+BOUNDINGS: dict[str, Callable[[Array, float, float], Array]] = {"clip": clipped, "tanh": spanned}
+"""Name -> (raw log standard deviation, its bounds) -> log standard deviation."""
+
+
 def squash(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
     """tanh(mean + std·noise) and its log-density (Eq. 14, with the change of variables of the tanh).
 
@@ -67,4 +82,4 @@ def squash(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
 def make_policy(settings: AlgorithmSettings, observation_size: int, action_size: int) -> Policy:
     """The policy for observations f32[..., observation_size] and actions f32[..., action_size]."""
     network = policy_network(settings, observation_size, 2 * action_size)
-    return Policy(network, settings.log_std_minimum, settings.log_std_maximum)
+    return Policy(network, settings.log_std_minimum, settings.log_std_maximum, BOUNDINGS[settings.log_std_bounding])

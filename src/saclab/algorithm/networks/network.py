@@ -59,6 +59,8 @@ class Design(NamedTuple):
     """A key of INITIALISATIONS: how a dense layer starts, where the network leaves it open."""
     dropout: float = 0.0
     """Share of the hidden units that are left out while the network learns."""
+    heads: int = 1
+    """Equal shares of the outputs that have a last hidden layer of their own, in a network that has such heads."""
 
 
 def relu(x: Array) -> Array:

@@ -13,8 +13,22 @@ SOLVED = -200.0  # mean evaluation return of Pendulum-v1 that counts as solved; 
 SEEDS = 2
 
 
-OTHERWISE = {"tqc": {"critic_hidden_layers": (64, 64), "dropped_quantiles": 1, "polyak_rate": 0.01}}
+SHORT = {"discount": 0.975}  # episodes of 200 steps
+OTHERWISE = {
+    "tqc": {"critic_hidden_layers": (64, 64), "dropped_quantiles": 1, "polyak_rate": 0.01},
+    "crossq": {"critic_hidden_layers": (128, 128)},
+    "xqc": SHORT
+    | {"critic_hidden_layers": (64, 64), "updates_per_interval": 2, "actor_interval": 1, "max_updates": 12_000},
+    "simbav2": SHORT | {"hidden_layers": (32,), "critic_hidden_layers": (64,), "max_updates": 8000},
+    "flashsac": SHORT | {"hidden_layers": (32, 32), "critic_hidden_layers": (32, 32)},
+}
 """What a variant needs beside the protocol to be steady after so few updates."""
+
+
+SETTINGS = {
+    "update_interval": 1, "random_steps": 1000, "hidden_layers": (64, 64), "max_updates": 5000,
+    "evaluation_interval_steps": 1000, "evaluation_episodes": 20,
+}  # fmt: skip
 
 
 @pytest.mark.slow
@@ -22,9 +36,7 @@ OTHERWISE = {"tqc": {"critic_hidden_layers": (64, 64), "dropped_quantiles": 1, "
 def test_every_variant_solves_pendulum_on_every_seed(variant: str, tmp_path: Path) -> None:
     changes = OTHERWISE.get(variant, {})
     result = saclab.compare(
-        ["Pendulum-v1"], [variant], SEEDS, "quick", runs=tmp_path,
-        update_interval=1, random_steps=1000, hidden_layers=(64, 64), max_updates=5000,
-        evaluation_interval_steps=1000, evaluation_episodes=20, **changes,
+        ["Pendulum-v1"], [variant], SEEDS, "quick", runs=tmp_path, **(SETTINGS | changes),
     )  # fmt: skip
     assert not result.failed
     final = {run.config.seed: float(run.evaluations["mean_return"][-1]) for run in result.runs}

@@ -12,10 +12,13 @@ import pytest
 from saclab.algorithm.networks.mlp import mlp
 from saclab.algorithm.networks.network import Design
 from saclab.training.process import compiled
+from saclab.variants import VARIANTS, variant_settings
 
 INPUTS, CRITICS = 23, 2
-HIDDEN_LAYERS = ((256, 256), (400, 300))
-ROWS = (1, 100, 256, *(pytest.param(rows, marks=pytest.mark.slow) for rows in (4096, 16_385, 32_769, 65_537)))
+SIZES = [(rows, hidden) for hidden in ((256, 256), (400, 300)) for rows in (1, 100, 256)]
+OF_VARIANTS = {variant_settings(variant, "HalfCheetah-v4").layers_of_critic for variant in VARIANTS}
+SLOW_SIZES = [(rows, hidden) for hidden in ((256, 256), (400, 300)) for rows in (4096, 16_385, 32_769, 65_537)]
+SLOW_SIZES += [(rows, hidden) for hidden in sorted(OF_VARIANTS) for rows in (256, 1024)]  # 512 rows in one joint pass
 
 
 @pytest.fixture(autouse=True)
@@ -43,8 +46,9 @@ def reference_gradients(vector, sizes, x) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(gradients), slope
 
 
-@pytest.mark.parametrize("hidden", HIDDEN_LAYERS)
-@pytest.mark.parametrize("rows", ROWS)
+@pytest.mark.parametrize(
+    ("rows", "hidden"), [*SIZES, *(pytest.param(*size, marks=pytest.mark.slow) for size in SLOW_SIZES)]
+)
 def test_products_and_their_gradients_are_right_in_every_row(rows, hidden):
     """tanh, since rounding alone turns a unit of relu off here and there, which is as much as a wrong row."""
     network, generator = mlp(INPUTS, hidden, 1, Design("tanh")), np.random.default_rng(0)

@@ -132,14 +132,15 @@ class Session:
             yield run, Started(writer.folder, writer.resumed_at_step, tuple(writer.notes))
         runs = self.engine.runs
         while True:
+            in_round = self._in_round()
             try:
-                if not self._in_round() and (due := [run for run in self.active if runs[run].evaluation_due()]):
+                if not in_round and (due := [run for run in self.active if runs[run].evaluation_due()]):
                     yield from self._evaluate(due)
                 if self.requests.stop:
                     yield from self._stop()
                     return
                 # before a save that comes by the clock: the last checkpoint is the one after the last evaluation
-                if not self._in_round() and (ending := self._ending()):
+                if not in_round and (ending := self._ending()):
                     yield from self._finish(ending)
             except Stopped:
                 yield from self._stop()
@@ -152,7 +153,7 @@ class Session:
                 self.last_progress = time.monotonic()
                 for run in self.active:
                     yield run, self.writers[run].progress()
-            yield from self._step()
+            yield from self._step(in_round)
 
     def _save_is_due(self) -> bool:
         return self.requests.save or time.monotonic() - self.last_save > self.checkpoint_seconds
@@ -169,15 +170,15 @@ class Session:
 
     def _in_round(self) -> bool:
         """Whether updates are left to make before the next step; the runs of an engine are equally far."""
-        return any(self.engine.runs[run].updates_left > 0 for run in self.active)
+        return bool(self.active) and self.engine.runs[self.active[0]].updates_left > 0
 
     def _ending(self) -> dict[int, str]:
         """The runs that are at their end, with the reason."""
         return {run: reason for run in self.active if (reason := self.engine.runs[run].finish_reason())}
 
-    def _step(self) -> Told:
-        """A step with its round of updates, or the rest of a round."""
-        if self._in_round():
+    def _step(self, in_round: bool) -> Told:
+        """A step with its round of updates, or the rest of a round that is under way."""
+        if in_round:
             self.engine.make_updates(self._should_pause)
             result = NOTHING_HAPPENED
         else:

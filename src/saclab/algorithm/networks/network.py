@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 Array = Any  # a NumPy or a JAX array of the kind given
 
@@ -124,8 +125,10 @@ def split(vector: Array, sizes: tuple[int, ...]) -> list[Array]:
     XLA would fuse with the sums over the batch that are the gradients of biases, each a loop as long as the longest
     part, masked beyond its own: up to twice the time of a whole update, where that reaches beyond mapped memory.
     """
-    *boundaries, _ = accumulate(sizes)
-    return [part[0] for part in vector.__array_namespace__().split(vector[None], boundaries, axis=1)]
+    ends = list(accumulate(sizes))
+    if isinstance(vector, np.ndarray):  # no gradient is asked of it, and a policy that acts is in a hurry
+        return [vector[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+    return [part[0] for part in vector.__array_namespace__().split(vector[None], ends[:-1], axis=1)]
 
 
 def project_kernels(

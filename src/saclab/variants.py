@@ -216,7 +216,7 @@ VARIANTS: dict[str, Variant] = {
             "reward_scaling": "deviation_or_bound",
             "target_entropy_per_action": -0.4781814,
         },
-        source="Holiday Robotics 2026",
+        source="Kim et al. 2026",
     ),
 }
 

@@ -91,7 +91,7 @@ def test_a_grid_of_run_groups_is_stopped_and_goes_on_bit_for_bit(tmp_path):
 
 def test_a_run_group_that_lost_some_runs_keeps_its_slots(tmp_path):
     """Two of four runs have finished when the others are continued: what is computed is the same."""
-    cells = grid(tmp_path, seeds=2)[::2]  # sac and averaged, two seeds each
+    cells = grid(tmp_path, seeds=2, max_updates=100_000)[::2]  # sac and averaged, two seeds each
     stop = Requests()
     for statuses in launch(cells, local_pool(1, threads=1, batch=2), stop, batch=2):
         if statuses[0].updates > 20:

@@ -44,6 +44,6 @@ def test_numpy_and_jax_agree_and_a_projection_is_idempotent(name):
     np.testing.assert_allclose(network.project(vector), vector, atol=1e-6)
     np.testing.assert_allclose(network.apply(np.asarray(vector), x), network.apply(vector, jnp.asarray(x)), atol=1e-5)
     assert np.asarray(network.apply(np.asarray(vector), x)).dtype == np.float32
-    outputs, statistics = network.train(vector, jnp.asarray(x), key=jax.random.PRNGKey(1))
+    outputs, statistics = jax.jit(network.train)(vector, jnp.asarray(x), key=jax.random.PRNGKey(1))
     assert outputs.shape == (5, 2)
     assert statistics.shape == (network.statistics,)

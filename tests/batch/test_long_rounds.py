@@ -61,7 +61,7 @@ def pausing_after(updates: int, requests: Requests) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_stop_between_two_parts_goes_on_bit_for_bit(tmp_path, delay):
     """In the first round, and in a later one of which two parts are made."""
     configs = mixed(acting_delay=delay, **LONG)

@@ -22,7 +22,7 @@ from .helpers import at_step, config, folders, mixed, stop_at, train
 
 
 @pytest.mark.parametrize("environment", ["Pendulum-v1", pytest.param("Hopper-v4", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("stop", [50, 149])
+@pytest.mark.parametrize("stop", [50, pytest.param(149, marks=pytest.mark.slow)])
 def test_a_stopped_group_goes_on_bit_for_bit(tmp_path, environment, stop):
     """The stop comes in the random steps or after, a window of metrics, a round of updates and an episode under way."""
     configs = mixed(environment=environment, snapshots=2)
@@ -37,6 +37,7 @@ def test_a_stopped_group_goes_on_bit_for_bit(tmp_path, environment, stop):
         assert_same_run(straight, stopped)
 
 
+@pytest.mark.slow
 def test_a_group_with_every_axis_at_once_goes_on_bit_for_bit(tmp_path):
     configs = [config("averaged-auto", seed, "HalfCheetah-v4", **TOGETHER) for seed in (0, 1)]
     train(tmp_path / "straight", configs)

@@ -58,6 +58,7 @@ def test_compare_trains_the_grid_and_writes_the_report(trained: Path) -> None:
     assert "Pendulum-v1" in page.read_text()
 
 
+@pytest.mark.slow
 def test_a_name_makes_an_arm_of_other_settings(trained: Path) -> None:
     result = saclab(
         "compare", "Pendulum-v1", "--variants", "averaged", "--name", "averaged-far", "--snapshot-interval", "20",
@@ -95,6 +96,7 @@ def test_evaluate_prints_the_return_of_the_best_policy(trained: Path) -> None:
     assert told["mean_return"] == pytest.approx(np.mean(told["total_rewards"]))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library to render with")
 def test_record_films_the_best_policy_without_a_screen(tmp_path: Path) -> None:
     trained = saclab(
@@ -111,6 +113,7 @@ def test_record_films_the_best_policy_without_a_screen(tmp_path: Path) -> None:
     assert "hopper.xyz" in refused.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_reproduce_forecasts_trains_and_says_that_it_is_scaled_down(tmp_path: Path, batch: int) -> None:
     arguments = ("reproduce", "--environments", "Pendulum-v1", "--variants", "sac", "--seeds", "1", "--updates", "20",
@@ -188,6 +191,7 @@ def without_seconds(path: Path) -> list[str]:
     return [line.rpartition(",")[0] for line in path.read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_one_failed_run_does_not_sink_the_others(tmp_path: Path) -> None:
     (tmp_path / "breaking.py").write_text(
         """

@@ -81,7 +81,12 @@ def tree(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("heading", sections())
+HEADINGS = list(sections())
+
+
+@pytest.mark.parametrize(
+    "heading", [HEADINGS[0], *(pytest.param(heading, marks=pytest.mark.slow) for heading in HEADINGS[1:])]
+)
 def test_the_steps_of_a_section_work(tree, heading):
     blocks = sections()[heading]
     for block in blocks:

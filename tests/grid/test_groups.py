@@ -141,6 +141,7 @@ def saved_at(cell: Cell, step: int) -> None:
     (cell.folder / f"checkpoints/step-{step:012d}").mkdir(parents=True)
 
 
+@pytest.mark.slow
 def test_compare_trains_run_groups_and_each_run_has_its_own_place(tmp_path):
     told = []
     result = saclab.compare(
@@ -161,6 +162,7 @@ def test_compare_trains_run_groups_and_each_run_has_its_own_place(tmp_path):
         assert read_last_session(run.path).machine.batch == 4
 
 
+@pytest.mark.slow
 def test_a_grid_begun_alone_goes_on_in_run_groups(tmp_path):
     """The runs of a laptop are those of a GPU: how a run is computed writes none of its settings."""
     settings = {name: value for name, value in SETTINGS.items() if name != "acting_delay"} | {"max_updates": 50}

@@ -56,7 +56,8 @@ def test_a_network_that_learns_equals_the_reference(name, updates):
         outputs, statistics = network.train(vector, x, key=jax.random.PRNGKey(0))
         return jnp.sum(outputs * weight), (outputs, statistics)
 
-    (d_vector, d_x), (outputs, statistics) = jax.grad(loss, (0, 1), has_aux=True)(jnp.asarray(vector), jnp.asarray(x))
+    gradient = jax.jit(jax.grad(loss, (0, 1), has_aux=True))
+    (d_vector, d_x), (outputs, statistics) = gradient(jnp.asarray(vector), jnp.asarray(x))
     layers, running = parts_of(vector, renormalised)
     output, moments, gradients, d_input = forward_backward(
         layers, x.astype(np.float64), weight.astype(np.float64), running if renormalised else None

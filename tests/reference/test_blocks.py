@@ -64,7 +64,7 @@ def assert_same_gradient(network: Network, vector: np.ndarray, loss: Callable[[n
     def ours(vector: jax.Array, x: jax.Array) -> jax.Array:
         return jnp.sum(network.train(vector, x, key=jax.random.PRNGKey(0))[0] * WEIGHT.astype(np.float32))
 
-    of_vector, of_x = jax.grad(ours, (0, 1))(jnp.float32(vector), jnp.float32(X))
+    of_vector, of_x = jax.jit(jax.grad(ours, (0, 1)))(jnp.float32(vector), jnp.float32(X))
     learnt = network.size - network.statistics
     generator = np.random.default_rng(5)
     for _ in range(12):
@@ -79,7 +79,7 @@ def test_the_residual_network_equals_the_reference():
     network = NETWORKS["batch_norm_residual"](INPUTS, (WIDTH,) * BLOCKS, OUTPUTS, DESIGN)
     vector = random_vector(network)
     parts = taken_apart(vector, FLASHSAC)
-    outputs, statistics = network.train(jnp.float32(vector), jnp.float32(X), key=jax.random.PRNGKey(0))
+    outputs, statistics = jax.jit(network.train)(jnp.float32(vector), jnp.float32(X), key=jax.random.PRNGKey(0))
     expected, met = numpy_blocks.flashsac(parts, BLOCKS, X)
     np.testing.assert_allclose(outputs, expected, rtol=1e-4, atol=1e-4)
     moved = [0.99 * parts[f"{name} running"] + 0.01 * met[name] for name in NORMALISED]

@@ -143,6 +143,7 @@ def seven(tmp_path_factory):
         return runs, write_report(runs, root / "out").parent
 
 
+@pytest.mark.slow
 def test_the_report_of_seven_arms_is_small_and_names_them(seven):
     _, out = seven
     page = (out / "index.html").read_text()

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import jax
+import pytest
 
 from saclab.training import process
 
@@ -52,6 +53,7 @@ def test_what_is_compiled_is_kept_and_gives_the_same_bits(tmp_path):
     assert fresh == first == second
 
 
+@pytest.mark.slow
 def test_a_damaged_entry_is_compiled_again(tmp_path):
     first, _ = trained(tmp_path / "first", tmp_path)
     for path in tmp_path.glob("saclab/xla/*/*-cache"):

@@ -1,4 +1,4 @@
-"""Settings of the axes that no variant uses yet, for the test matrices that must hold on all of them."""
+"""Settings of the axes, alone and together, for the test matrices that must hold on all of them."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ MOST = {
     "evaluation_episodes": 100_000,
     "q_bias_episodes": 100_000,
     "longest_noise": 10_000,
+    "n_step": 1000,
 }
 """Setting -> its largest value, where each one more is made or gone through one by one."""
 MOST_THREADS = 4096

@@ -58,8 +58,8 @@ PROTOCOLS: dict[str, Protocol] = {
     ),
     "quick": Protocol(
         "Minutes instead of hours, to see every part at work: smaller batches and larger steps than the others, and "
-        "too short to judge a variant by. A variant's own batches, layers and updates per step are held to what that "
-        "allows.",
+        "too short to judge a variant by. A variant's own batches, layers, updates per step, random steps and "
+        "period of the policy are held to what that allows.",
         TrainingSettings(
             random_steps=2_000,
             update_interval=2,

@@ -33,7 +33,7 @@ def require_ranges(settings: AlgorithmSettings) -> None:
     check("critic_atoms", lambda value: value >= 2, "use a whole number of at least 2, such as 101")
     check("critic_bound", lambda value: value > 0, "use a value above 0, such as 5")
     check("final_learning_rate_share", lambda value: 0 <= value <= 1, "use a value in [0, 1], such as 0.5")
-    check("critic_dropout", lambda value: 0 <= value < 1, "use a value in [0, 1), such as 0.01")
+    check("critic_dropout", lambda value: value == 0 or 2e-5 <= value <= 0.99, "use 0, or a value from 2e-5 to 0.99")
     check("dropped_quantiles", lambda value: value >= 0, "use a whole number of at least 0")
     check(
         "target_critics", lambda value: value is None or value >= 1, "use a whole number of at least 1, or leave it out"

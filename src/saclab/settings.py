@@ -72,7 +72,7 @@ class AlgorithmSettings:
     critics: int = 2
     """Q-networks that are trained side by side."""
     critic_dropout: float = 0.0
-    """Share of a Q-network's hidden units that are left out at random while it learns, in [0, 1)."""
+    """Share of a Q-network's hidden units that are left out at random while it learns: 0, or 2e-5 to 0.99."""
     critic_head: Literal["scalar", "categorical", "quantile"] = "scalar"
     """What a Q-network predicts: a number, a distribution over `critic_atoms` values, or as many quantiles of one."""
     critic_atoms: int = 101

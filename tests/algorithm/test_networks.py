@@ -209,3 +209,12 @@ def test_batch_renormalisation_by_hand(updates, expected):
     mean, variance = renormalised_moments(*moments, jnp.array([[0.0], [1.0]]), [jnp.array([float(updates)])])
     normal = normalise(jnp.array([[3.0]]), mean, variance, jnp.ones(1), jnp.zeros(1))
     np.testing.assert_allclose(normal, [[expected]], atol=5e-4)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_rows_that_are_all_alike_have_a_finite_gradient(name):
+    """A batch of one, or a unit that is the same in every row: a variance of exactly 0."""
+    network = NETWORKS[name](3, (4,), 2, Design("tanh"))
+    vector, x = jnp.asarray(random_vector(network)), jnp.ones((3, 3), jnp.float32)
+    gradient = jax.jit(jax.grad(lambda vector: jnp.sum(network.train(vector, x, key=KEY)[0] ** 2)))(vector)
+    assert np.isfinite(gradient).all()

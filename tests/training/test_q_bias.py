@@ -51,7 +51,12 @@ def test_steps_near_a_time_limit_are_left_out() -> None:
 
 
 def pendulum_bias(
-    discount: float, shift: float, reduction: str = "minimum", critics_moved: int = 2, name: str = "Pendulum-v1"
+    discount: float,
+    shift: float,
+    reduction: str = "minimum",
+    critics_moved: int = 2,
+    name: str = "Pendulum-v1",
+    reward_scale: float = 1.0,
 ) -> QBias:
     """The bias of random critics, of some of which the output's bias is moved by `shift`."""
     settings = AlgorithmSettings(hidden_layers=(8,), discount=discount)
@@ -61,8 +66,17 @@ def pendulum_bias(
     state = learner.init(scalars(settings, spec.action_size), jax.random.PRNGKey(0))
     critic = np.array(state.critic.weights)
     critic[:critics_moved, -1] += shift  # the last parameter is the output's bias
-    critics = Critics(learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount, reduction)
+    critics = Critics(
+        learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount, reduction, reward_scale
+    )
     return measure_q_bias(critics, environment, [1, 2], np.random.default_rng(0))
+
+
+def test_the_truth_is_divided_as_the_rewards_that_the_critics_learn_from() -> None:
+    """Without a discount a return is a reward: a tenth of it under a scale of 10, and Q stays as it is."""
+    plain, scaled = pendulum_bias(0.0, 0.0), pendulum_bias(0.0, 0.0, reward_scale=10.0)
+    assert scaled.mean_return == pytest.approx(plain.mean_return / 10)
+    assert scaled.mean_q == plain.mean_q
 
 
 def test_moving_q_moves_the_bias_by_as_much_over_the_mean_return() -> None:

@@ -97,11 +97,13 @@ class DeviceEngine:
     def make_updates(self, should_pause: Callable[[], bool] = never) -> None:
         """Have the devices make the updates that are left, in parts; the last one with the next step."""
         active = [state if run in self.active else None for run, state in enumerate(self.runs)]
+        moved = self.experience is not None  # each call goes on by a part at least, however often it is to pause
         while self.updates < self.training.updates_due(self.steps):
             self.flush()
             jax.block_until_ready(self.undelivered[-1:])  # type: ignore[no-untyped-call]
-            if should_pause():
+            if moved and should_pause():
                 return
+            moved = True
             rows, position = self.replay.newest(self.steps, self.training.parallel_environments)
             self.experience = Experience(rows[: len(active)], position[: len(active)], self._draw(active))
 
@@ -133,7 +135,9 @@ class DeviceEngine:
         jobs = []
         for run in wanted:
             learner = self._learner(run)
-            header = {"do": "q_bias", "run": run, "evaluation": self.runs[run].counters.evaluations + 1}
+            state = self.runs[run]
+            header = {"do": "q_bias", "run": run, "evaluation": state.counters.evaluations + 1,
+                      "reward_scale": float(state.reward_scale.value)}  # fmt: skip
             judged = {"actor": learner.actor, "critic": learner.critic, "log_alpha": learner.temperature}
             jobs.append((header, {name: np.asarray(trained.weights) for name, trained in judged.items()}))
         replies = self.pool.work_off(jobs, should_stop)

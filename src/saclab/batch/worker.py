@@ -121,7 +121,9 @@ class EnvironmentWorker:
     def q_bias(self, header: dict[str, Any], arrays: Arrays) -> Message:
         """How far one run's critics are from Monte-Carlo soft returns."""
         config, learner = self.configs[header["run"]], self._learner(header["run"])
-        critics = critics_of(config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"])
+        critics = critics_of(
+            config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"], header["reward_scale"]
+        )
         try:
             environment, stop = self.evaluator.environments[0], self.buffers.stop
             bias = q_bias_at(config, critics, environment, header["evaluation"], lambda: bool(stop[0]))

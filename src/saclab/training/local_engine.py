@@ -176,7 +176,12 @@ class LocalEngine:
         if config.training.q_bias_episodes == 0:
             return {}
         critics = critics_of(
-            config, self.learner, self.actor(0), np.array(state.critic.weights), np.asarray(state.temperature.weights)
+            config,
+            self.learner,
+            self.actor(0),
+            np.array(state.critic.weights),
+            np.asarray(state.temperature.weights),
+            float(self.run.reward_scale.value),
         )
         try:
             environment, number = self.evaluator.environments[0], self.run.counters.evaluations + 1

@@ -41,6 +41,8 @@ class Critics(NamedTuple):
     discount: float
     reduction: str
     """How the policy loss reduces the critics to one Q: the setting actor_reduction."""
+    reward_scale: float = 1.0
+    """What the critics' rewards are divided by: their Q is that of scaled rewards, so the truth must be too."""
 
     def q(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
         """What the policy is trained to raise: f32[n] for f32[n, O] and f32[n, A]."""
@@ -77,13 +79,18 @@ class Episode(NamedTuple):
 
 
 def critics_of(
-    config: Config, learner: Learner, actor: np.ndarray, critic: np.ndarray, log_alpha: np.ndarray | float
+    config: Config,
+    learner: Learner,
+    actor: np.ndarray,
+    critic: np.ndarray,
+    log_alpha: np.ndarray | float,
+    reward_scale: float,
 ) -> Critics:
     """The critics of a run, and what their Q stands for."""
     settings = config.algorithm
     return Critics(
         learner.policy, actor, learner.q_values, critic, float(np.exp(np.asarray(log_alpha))), settings.discount,
-        settings.actor_reduction,
+        settings.actor_reduction, reward_scale,
     )  # fmt: skip
 
 
@@ -112,7 +119,8 @@ def measure_q_bias(
         Stopped: when `should_stop`.
     """
     episodes = [play(critics, environment, seed, generator, should_stop) for seed in episode_seeds]
-    known = [known_returns(episode, critics.alpha, critics.discount) for episode in episodes]
+    scaled = [episode._replace(reward=episode.reward / critics.reward_scale) for episode in episodes]
+    known = [known_returns(episode, critics.alpha, critics.discount) for episode in scaled]
     returns = np.concatenate(known)
     q = np.concatenate([
         critics.q(episode.observation[: len(part)], episode.action[: len(part)])

@@ -197,7 +197,8 @@ def renormalised_moments(
     shift = jnp.clip((mean - running[0]) / running_deviation, -LARGEST_SHIFT, LARGEST_SHIFT)
     ratio, shift = jax.lax.stop_gradient((ratio, shift))
     warm = updates[0] >= WARM_UPDATES
-    corrected = mean - shift * jnp.sqrt(variance) / ratio
+    deviation = jnp.sqrt(jnp.maximum(variance, 1e-12))  # of rows that are all alike it would have an endless slope
+    corrected = mean - shift * deviation / ratio
     return jnp.where(warm, corrected, mean), jnp.where(warm, variance / ratio**2, variance)
 
 

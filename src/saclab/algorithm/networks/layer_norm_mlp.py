@@ -56,9 +56,10 @@ def layer_norm_mlp(inputs: int, hidden_layers: tuple[int, ...], outputs: int, de
 
 
 def dropped_out(x: jax.Array, key: jax.Array, rate: float) -> jax.Array:
-    """A share `rate` of f32[B, W] set to 0, the rest divided by 1 − rate (Srivastava et al. 2014)."""
-    kept = jax.random.bits(key, x.shape, jnp.uint16) >= round(rate * DRAWS)
-    return jnp.where(kept, x / (1 - rate), 0)
+    """A share `rate` of f32[B, W], to 16 bits, set to 0, the rest divided by what is left (Srivastava et al. 2014)."""
+    out = round(rate * DRAWS)
+    kept = jax.random.bits(key, x.shape, jnp.uint16) >= out
+    return jnp.where(kept, x / (1 - out / DRAWS), 0)
 
 
 def normalise(x: Array) -> Array:

@@ -20,7 +20,7 @@ from saclab.training.local_engine import LocalEngine
 from saclab.training.process import prepare_process
 from saclab.variants import VARIANTS
 
-ROUNDS, SECONDS, ENVIRONMENT = 5, 2.0, "HalfCheetah-v4"
+ROUNDS, SECONDS, ENVIRONMENT = 3, 2.0, "HalfCheetah-v4"
 
 
 def prepared(variant: str) -> LocalEngine:

@@ -68,29 +68,34 @@ VARIANTS: dict[str, Variant] = {
         "SAC",
         "Fixed temperature, the smaller of two Q-networks, Polyak targets (Eq. 2-5).",
         paper_name="sac",
+        cost=1,
     ),
     "sac-auto": Variant(
         "SAC, learned α",
         "The temperature is learned so that the policy keeps a target entropy (Eq. 8).",
         LEARNED,
         paper_name="sac-alpha-tuning",
+        cost=0.95,
     ),
     "averaged": Variant(
         "Averaged-SAC",
         "The next state's value is the mean over the last K target networks (Eq. 9).",
         AVERAGED,
         paper_name="averaged-sac",
+        cost=1.95,
     ),
     "averaged-auto": Variant(
         "Averaged-SAC, learned α",
         "Averaged targets (Eq. 9) and a learned temperature (Eq. 8): the paper's first future experiment.",
         AVERAGED | LEARNED,
+        cost=2.04,
     ),
     "averaged-entropy": Variant(
         "Averaged entropy term (not Eq. 9)",
         "What the paper's authors ran under the name Averaged-SAC: no value is averaged, only the entropy term "
         "α·log π, row by row over the last K unrelated minibatches. Kept to check their published numbers.",
         {"entropy_window": 10},
+        cost=1.01,
     ),
     "redq": Variant(
         "REDQ",
@@ -99,6 +104,7 @@ VARIANTS: dict[str, Variant] = {
         ENSEMBLE | {"critics": 10, "target_critics": 2},
         {prefix: {"target_entropy": entropy} for prefix, entropy in ENSEMBLE_ENTROPY.items()},
         source="Chen et al. 2021",
+        cost=37.9,
     ),
     "droq": Variant(
         "DroQ",
@@ -109,6 +115,7 @@ VARIANTS: dict[str, Variant] = {
             for prefix, entropy in ENSEMBLE_ENTROPY.items()
         },
         source="Hiraoka et al. 2022",
+        cost=20.6,
     ),
     "tqc": Variant(
         "TQC",
@@ -126,6 +133,7 @@ VARIANTS: dict[str, Variant] = {
         },
         {"HalfCheetah-": {"dropped_quantiles": 0}, "Hopper-": {"dropped_quantiles": 5}},
         source="Kuznetsov et al. 2020",
+        cost=12.5,
     ),
     "crossq": Variant(
         "CrossQ",
@@ -148,6 +156,7 @@ VARIANTS: dict[str, Variant] = {
         },
         {"Swimmer-": {"discount": 0.9999}},
         source="Bhatt et al. 2024",
+        cost=45.8,
     ),
     "xqc": Variant(
         "XQC",
@@ -170,6 +179,7 @@ VARIANTS: dict[str, Variant] = {
             "target_entropy_per_action": -0.5,
         },
         source="Palenicek et al. 2025",
+        cost=18.9,
     ),
     "simbav2": Variant(
         "SimbaV2",
@@ -196,6 +206,7 @@ VARIANTS: dict[str, Variant] = {
             "target_entropy_per_action": -0.5,
         },
         source="Lee et al. 2025",
+        cost=78.5,
     ),
     "flashsac": Variant(
         "FlashSAC",
@@ -223,6 +234,7 @@ VARIANTS: dict[str, Variant] = {
             "target_entropy_per_action": -0.4781814,
         },
         source="Kim et al. 2026",
+        cost=26.8,
     ),
 }
 

@@ -52,6 +52,7 @@ def test_several_runs_at_once_need_several_buffers(one_gib):
         ({"batch_size": 10_000, "hidden_layers": (8192,)}, r"batch_size = 10000: .* GiB.*smaller --batch-size"),
         ({"entropy_window": 10**7}, r"batch_size = 32: .* take 1\.19 GiB"),
         ({"critic_head": "categorical", "critic_atoms": 10_000}, r"batch_size = 32: .* GiB"),
+        ({"batch_size": 512, "n_step": 1000}, r"batch_size = 512: .* take 1\.4\d GiB"),
     ],
 )
 def test_networks_and_batches_that_do_not_fit_are_refused(one_gib, overrides, refused):
@@ -72,6 +73,15 @@ LARGE = {
     "policy": {"hidden_layers": (512, 512), "critic_hidden_layers": (16,)},
     "batch_norm": {"hidden_layers": (256,), "network": "batch_norm_mlp", "joint_forward": True, "batch_size": 1024},
     "entropy": {"entropy_window": 100_000},
+    "quantile": {
+        "critic_head": "quantile",
+        "critic_atoms": 25,
+        "critics": 5,
+        "target_reduction": "truncated",
+        "dropped_quantiles": 20,
+        "batch_size": 128,
+    },
+    "ensemble": {"critics": 10, "target_critics": 2, "hidden_layers": (128, 128), "snapshots": 4, "batch_size": 512},
 }
 QUICK = ("categorical", "entropy")
 

@@ -54,15 +54,19 @@ def batch_numbers(settings: AlgorithmSettings, layout: RowLayout) -> int:
     size, critics = settings.batch_size, settings.critics
     widths = (*settings.layers_of_critic, head_outputs(settings))
     rows = 2 * size if settings.joint_forward else size
-    of_critics = critics * rows * (2 * sum(widths) + settings.snapshots * max(widths))
+    valuing = settings.target_critics or critics
+    of_critics = critics * rows * 2 * sum(widths) + valuing * rows * settings.snapshots * max(widths)
     if settings.critic_head == "categorical":
         of_critics += size * settings.critic_atoms**2  # the distance of each value from each
     if settings.critic_head == "quantile":
-        pooled = critics if settings.target_reduction == "truncated" else 1
-        of_critics += critics * size * settings.critic_atoms**2 * pooled  # of each quantile from each of the target
+        of_target = settings.critic_atoms
+        if settings.target_reduction == "truncated":
+            of_target = valuing * (settings.critic_atoms - settings.dropped_quantiles)
+        of_critics += critics * size * settings.critic_atoms * of_target  # of each quantile from each of the target
     rows = 2 * size if settings.actor_joint_forward else size
     of_policy = 2 * (rows * sum((*settings.hidden_layers, 2 * layout.action_size)) + critics * size * sum(widths))
-    return max(of_critics, of_policy) + settings.entropy_window * size
+    windows = size * settings.n_step * layout.width if settings.n_step > 1 else 0
+    return max(of_critics, of_policy) + settings.entropy_window * size + windows
 
 
 def head_outputs(settings: AlgorithmSettings) -> int:

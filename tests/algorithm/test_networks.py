@@ -109,7 +109,7 @@ def test_unit_columns_have_length_one_and_leave_the_rest(name):
 
 def test_joint_statistics_by_hand():
     x = jnp.array([[0.0], [2.0], [10.0], [12.0]])  # s = 0, 2 and s' = 10, 12: mean 6, variance 26
-    normalised = normalise(x, x.mean(0), x.var(0), jnp.ones(1), jnp.zeros(1))
+    normalised = normalise(x, (x.mean(0), x.var(0)), (jnp.ones(1), jnp.zeros(1)), EPSILON)
     np.testing.assert_allclose(normalised[:, 0], [-1.177, -0.784, 0.784, 1.177], atol=1e-3)
 
 
@@ -206,8 +206,8 @@ def test_xavier_weights_are_uniform_up_to_their_bound_and_biases_zero():
 def test_batch_renormalisation_by_hand(updates, expected):
     """A batch of mean 1 and variance 4, running moments of 0 and 1: x = 3 comes out as 3 once they have settled."""
     moments = [jnp.array([1.0]), jnp.array([4.0])]
-    mean, variance = renormalised_moments(*moments, jnp.array([[0.0], [1.0]]), [jnp.array([float(updates)])])
-    normal = normalise(jnp.array([[3.0]]), mean, variance, jnp.ones(1), jnp.zeros(1))
+    mean, variance = renormalised_moments(*moments, jnp.array([[0.0], [1.0]]), jnp.array([float(updates)]))
+    normal = normalise(jnp.array([[3.0]]), (mean, variance), (jnp.ones(1), jnp.zeros(1)), EPSILON)
     np.testing.assert_allclose(normal, [[expected]], atol=5e-4)
 
 

@@ -26,16 +26,23 @@ from saclab.training.run_folder import is_finished, read_run
 
 from .helpers import at_step, config, engine_of, failures, folders, mixed, tiny_environments, train
 
+OF_EPISODES = {"n_step": 3, "observation_normalisation": "running"}
+
 
 @pytest.mark.parametrize(
-    ("environment", "environments"),
-    [("Pendulum-v1", 1), ("Fragile-v0", 3), pytest.param("Pendulum-v1", 3, marks=pytest.mark.slow)],
+    ("environment", "environments", "changes"),
+    [
+        ("Pendulum-v1", 1, {}),
+        ("Fragile-v0", 3, OF_EPISODES),
+        pytest.param("Fragile-v0", 3, {}, marks=pytest.mark.slow),
+        pytest.param("Pendulum-v1", 3, OF_EPISODES, marks=pytest.mark.slow),
+    ],
 )
-def test_a_run_of_a_group_is_the_run_alone(tmp_path, monkeypatch, environment, environments):
+def test_a_run_of_a_group_is_the_run_alone(tmp_path, monkeypatch, environment, environments, changes):
     """Equal but for rounding, as long as Pendulum does not make a difference of it; episodes end in the other one."""
     with tiny_environments(monkeypatch) as prefix:
         name = prefix + environment if environment == "Fragile-v0" else environment
-        configs = mixed(environment=name, parallel_environments=environments, max_steps=150)
+        configs = mixed(environment=name, parallel_environments=environments, max_steps=150, **changes)
         if environment == "Fragile-v0":
             configs = [make(each, "nan", broken_at=10**9) for each in configs]
         assert failures(train(tmp_path, configs)) == {}

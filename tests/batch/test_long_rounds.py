@@ -61,6 +61,18 @@ def pausing_after(updates: int, requests: Requests) -> Iterator[None]:
         yield
 
 
+def test_a_round_that_is_always_to_pause_still_goes_on():
+    """As where checkpoints are due all the time: each call makes a part at least."""
+    with closing(engine_of(mixed(**LONG))) as group:
+        while group.updates < ROUND:
+            before = group.steps, group.updates
+            if group.runs[0].updates_left > 0:
+                group.make_updates(lambda: True)
+            else:
+                group.step(lambda: True)
+            assert (group.steps, group.updates) > before
+
+
 @pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_stop_between_two_parts_goes_on_bit_for_bit(tmp_path, delay):
     """In the first round, and in a later one of which two parts are made."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -108,6 +109,16 @@ def test_a_stop_within_the_q_bias_goes_on_bit_for_bit(tmp_path):
     assert_same_run(tmp_path / "straight", tmp_path / "stopped")
 
 
+def told_of_a_stop(process: subprocess.Popen[str]) -> None:
+    """Stop a process by SIGTERM: within the seconds that are promised, and it says how to go on."""
+    began = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=60)
+    assert time.monotonic() - began < WITHIN_SECONDS
+    assert process.returncode == 143, output
+    assert "saved; continue with" in output
+
+
 @pytest.mark.slow
 def test_a_process_stops_within_a_hundred_thousand_updates(tmp_path):
     """And goes on there: nothing is lost and nothing made twice."""
@@ -118,12 +129,7 @@ def test_a_process_stops_within_a_hundred_thousand_updates(tmp_path):
     time.sleep(8)
     updates = [0]
     for _ in range(2):
-        began = time.monotonic()
-        process.send_signal(signal.SIGTERM)
-        output, _ = process.communicate(timeout=60)
-        assert time.monotonic() - began < WITHIN_SECONDS
-        assert process.returncode == 143, output
-        assert "saved; continue with" in output
+        told_of_a_stop(process)
         name = newest_first(folder / "checkpoints")[0].name
         assert name.startswith("step-000000000062-update-")
         updates.append(int(name.rpartition("-")[2]))
@@ -141,10 +147,5 @@ def test_a_process_stops_within_a_long_q_bias(tmp_path):
     folder = tmp_path / "runs/Pendulum-v1/sac-auto/standard/seed-0"
     wait_for(lambda: (folder / "q_bias.csv").exists() or process.poll() is not None)
     time.sleep(5)
-    began = time.monotonic()
-    process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=60)
-    assert time.monotonic() - began < WITHIN_SECONDS
-    assert process.returncode == 143, output
-    assert "saved; continue with" in output
+    told_of_a_stop(process)
     assert newest_first(folder / "checkpoints")[0].name == "step-000000000050-untested"

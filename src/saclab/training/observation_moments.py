@@ -10,6 +10,7 @@ import numpy as np
 
 from saclab.training.captured import require_like
 from saclab.training.checkpoint import Arrays
+from saclab.training.running import merged
 
 EPSILON = 1e-8
 
@@ -33,14 +34,10 @@ class ObservationMoments:
         return self.kind != "none"
 
     def enter(self, observation: np.ndarray) -> None:
-        """Take in the observations f32[N, O] from which a step was taken (Chan et al. 1979)."""
-        if not self.active:
-            return
-        observation = observation.astype(np.float64)
-        seen, count = len(observation), self.count[0]
-        total, shift = count + seen, observation.mean(axis=0) - self.mean
-        squares = count * self.variance + seen * observation.var(axis=0) + shift**2 * count * seen / total
-        self.count, self.mean, self.variance = np.array([total]), self.mean + shift * seen / total, squares / total
+        """Take in the observations f32[N, O] from which a step was taken."""
+        if self.active:
+            seen = observation.astype(np.float64)
+            self.count, self.mean, self.variance = merged(self.count, self.mean, self.variance, seen)
 
     @property
     def value(self) -> np.ndarray | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from saclab.training.captured import require_like
 from saclab.training.checkpoint import Arrays
+from saclab.training.running import merged
 
 EPSILON = 1e-8
 FIRST_COUNT = 1e-4  # of the start's variance of 1
@@ -54,10 +55,7 @@ class RewardScale:
             return
         self.returns = self.discount * (1 - ended) * self.returns + reward
         count, mean, variance = self.moments
-        seen, total = len(reward), count + len(reward)
-        shift = self.returns.mean() - mean
-        squares = count * variance + seen * self.returns.var() + shift**2 * count * seen / total
-        self.moments = np.array([total, mean + shift * seen / total, squares / total])
+        self.moments = np.array(merged(count, mean, variance, self.returns))
         self.largest = np.maximum(self.largest, np.abs(self.returns).max())
 
     @property

@@ -15,11 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from saclab.algorithm.networks.batch_norm_mlp import moved_towards, normalise
 from saclab.algorithm.networks.network import ACTIVATIONS, Array, Design, Network
 from saclab.algorithm.networks.packing import Packing, joined
 
 EXPANSION = 4
-MOMENTUM = 0.99
 EPSILON = 1e-5
 RMS_EPSILON = 1e-6
 
@@ -59,7 +59,7 @@ def batch_norm_residual(inputs: int, hidden_layers: tuple[int, ...], outputs: in
         def seen(name: str, x: jax.Array) -> tuple[jax.Array, jax.Array]:
             mean, variance, rows = jnp.mean(x, axis=0), jnp.var(x, axis=0), len(x)
             unbiased = variance * (rows / max(1, rows - 1))
-            moved[name] = MOMENTUM * parts[f"{name} running"] + (1 - MOMENTUM) * jnp.stack([mean, unbiased])
+            moved[name] = moved_towards(parts[f"{name} running"], mean, unbiased)
             return mean, variance
 
         y = forward(parts, blocks, nonlinearity, joined(inputs), seen)
@@ -68,7 +68,7 @@ def batch_norm_residual(inputs: int, hidden_layers: tuple[int, ...], outputs: in
     def project(vector: jax.Array) -> jax.Array:
         if design.projection == "none":
             return vector
-        parts = packing.unit_kernels(packing.unpack(vector))
+        parts = packing.projected(packing.unpack(vector), design.projection)
         for name in ("rms scale", *affine):
             parts[name] = unit_mean_square(parts[name])
         return packing.pack(parts)
@@ -83,8 +83,7 @@ def forward(
     xp: Any = x.__array_namespace__()
 
     def normalised(name: str, x: Array) -> Array:
-        (mean, variance), (scale, bias) = moments(name, x), parts[f"{name} affine"]
-        return (x - mean) / xp.sqrt(variance + EPSILON) * scale + bias
+        return normalise(x, moments(name, x), parts[f"{name} affine"], EPSILON)
 
     x = normalised("inputs", x) @ parts["inputs kernel"]
     for block in range(blocks):

@@ -40,7 +40,7 @@ def hyperspherical(inputs: int, hidden_layers: tuple[int, ...], outputs: int, de
 
     def init(key: jax.Array) -> jax.Array:
         parts = {name: jnp.full(shape, stored(name, width)) for name, shape in shapes.items()}
-        return packing.pack(packing.unit_kernels(parts | packing.orthogonal_kernels(key)))
+        return packing.pack(packing.projected(parts | packing.orthogonal_kernels(key), "unit_columns"))
 
     def apply(vector: Array, *inputs: Array) -> Array:
         parts = packing.unpack(vector)
@@ -57,7 +57,7 @@ def hyperspherical(inputs: int, hidden_layers: tuple[int, ...], outputs: int, de
     def project(vector: jax.Array) -> jax.Array:
         if design.projection == "none":
             return vector
-        return packing.pack(packing.unit_kernels(packing.unpack(vector)))
+        return packing.pack(packing.projected(packing.unpack(vector), design.projection))
 
     return Network(init, apply, train, project, sum(packing.sizes))
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from saclab.algorithm.networks.network import Array, orthogonal, split, unit_columns
+from saclab.algorithm.networks.network import PROJECTIONS, Array, orthogonal, split
+
+Parts = dict[str, jax.Array]
 
 
 class Packing(NamedTuple):
@@ -25,22 +28,25 @@ class Packing(NamedTuple):
         parts = zip(self.shapes.items(), split(vector, self.sizes), strict=True)
         return {name: part.reshape(shape) for (name, shape), part in parts}
 
-    def pack(self, parts: dict[str, jax.Array]) -> jax.Array:
+    def pack(self, parts: Parts) -> jax.Array:
         """f32[P] of the parts."""
         return jnp.concatenate([parts[name].ravel() for name in self.shapes])
 
-    def orthogonal_kernels(self, key: jax.Array) -> dict[str, jax.Array]:
-        """Every kernel f32[I, O] with orthonormal rows or columns."""
-        names = [name for name in self.shapes if name.endswith("kernel")]
-        keys = jax.random.split(key, len(names))
+    @property
+    def kernels(self) -> list[str]:
+        return [name for name in self.shapes if name.endswith("kernel")]
+
+    def orthogonal_kernels(self, key: jax.Array, gain: Callable[[str], float] = lambda name: 1.0) -> Parts:
+        """Every kernel f32[I, O] with orthonormal rows or columns, times its gain."""
+        keys = jax.random.split(key, len(self.kernels))
         return {
-            name: orthogonal(own, (self.shapes[name][0], self.shapes[name][1]))
-            for name, own in zip(names, keys, strict=True)
+            name: orthogonal(own, (self.shapes[name][0], self.shapes[name][1]), gain(name))
+            for name, own in zip(self.kernels, keys, strict=True)
         }
 
-    def unit_kernels(self, parts: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """`parts` with the weights into each unit scaled to length 1."""
-        return {name: unit_columns(part) if name.endswith("kernel") else part for name, part in parts.items()}
+    def projected(self, parts: Parts, projection: str) -> Parts:
+        """`parts` with each kernel projected as a key of PROJECTIONS says."""
+        return parts | {name: PROJECTIONS[projection](parts[name]) for name in self.kernels}
 
 
 def length(x: Array) -> Array:

@@ -75,7 +75,7 @@ def test_plain_numbers_do_not_separate_run_groups(tmp_path, change, same):
 
 @pytest.mark.slow
 def test_a_grid_of_run_groups_is_stopped_and_goes_on_bit_for_bit(tmp_path):
-    whole, stopped = grid(tmp_path / "whole", seeds=1), grid(tmp_path / "stopped", seeds=1)
+    whole, stopped = (grid(tmp_path / name, seeds=1, max_updates=5000) for name in ("whole", "stopped"))
     *_, statuses = launch(whole, local_pool(2, threads=1, batch=4), Requests(), batch=4)
     assert {status.status for status in statuses} == {"finished"}
     requests = Requests()

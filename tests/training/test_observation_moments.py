@@ -77,8 +77,13 @@ def normalised(state):
 
 @pytest.mark.parametrize("name", ["sac-auto/mlp", pytest.param("xqc/batch_norm_mlp", marks=pytest.mark.slow)])
 def test_an_update_is_that_of_normalised_transitions(case_of, name):
-    """Stored as they came, they are learnt from as if they had been normalised before."""
-    plain, with_axis = case_of(name), case_of(name, observation_normalisation="running")
+    """Stored as they came, they are learnt from as if they had been normalised before.
+
+    Batch normalisation leaves gradients that are 0 but for rounding, and Adam makes whole steps of them: the gradients
+    are compared, and the steps are so short that what comes after them does not notice.
+    """
+    short = {f"{trained}_learning_rate": 1e-7 for trained in ("actor", "critic", "temperature")}
+    plain, with_axis = case_of(name, **short), case_of(name, observation_normalisation="running", **short)
     start, batch = plain.initial_state(), plain.batch(np.random.default_rng(0))
     seen = batch._replace(
         observation=(batch.observation - MOMENTS[0]) / MOMENTS[1],
@@ -90,8 +95,10 @@ def test_an_update_is_that_of_normalised_transitions(case_of, name):
     got = with_axis.compiled(with_axis.numbers, begun, batch, given)
     np.testing.assert_allclose(got.report, expected.report, rtol=1e-4, atol=1e-5)
     for ours, theirs in ((got.actor, expected.actor), (got.critic, expected.critic)):
-        size = theirs.weights.shape[-1]
-        np.testing.assert_allclose(ours.weights[..., :size], theirs.weights, rtol=1e-4, atol=1e-5)
+        size, gradient = theirs.weights.shape[-1], np.asarray(theirs.moments.mu)
+        scale = np.abs(gradient).max()
+        assert scale > 0
+        np.testing.assert_allclose(ours.moments.mu[..., :size], gradient, rtol=1e-4, atol=1e-4 * scale)
         assert not np.asarray(ours.moments.mu)[..., size:].any(), "the moments are not trained"
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from saclab.errors import require, unknown_name
@@ -222,7 +222,7 @@ class TrainingSettings:
         for name in ("random_steps", "q_bias_episodes"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "use 0 or more")
         require(
-            (self.max_steps, self.max_updates, self.max_episodes) != (None, None, None),
+            bool(self.limits),
             "max_steps", None, "give at least one of max_steps, max_updates and max_episodes",
         )  # fmt: skip
         require(
@@ -236,6 +236,12 @@ class TrainingSettings:
     def update_to_data_ratio(self) -> float:
         """Updates per environment step."""
         return self.updates_per_interval / self.update_interval
+
+    @cached_property
+    def limits(self) -> dict[str, int]:
+        """What ends a run -> how much of it at most."""
+        limits = {"steps": self.max_steps, "updates": self.max_updates, "episodes": self.max_episodes}
+        return {name: limit for name, limit in limits.items() if limit is not None}
 
     def updates_due(self, steps: int) -> int:
         """Updates that should have been made once `steps` environment steps are done."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -136,7 +137,7 @@ class TrainingEnvironments:
         self._require_finite(index, self.observation[index], 0.0, np.zeros(0, np.float32))
 
     def _require_finite(self, index: int, observation: np.ndarray, reward: float, action: np.ndarray) -> None:
-        if np.isfinite(reward) and np.isfinite(observation).all():
+        if math.isfinite(reward) and np.isfinite(observation).all():
             return
         broken = np.flatnonzero(~np.isfinite(observation)).tolist()
         what = f"observation entries {broken[:10]}" if broken else f"reward {reward}"

@@ -102,7 +102,7 @@ class LocalEngine:
         counters.steps += len(self.environments)
         if run.updates_left:
             self._actor_before = self.actor(0)
-        self.make_updates(should_pause)
+            self.make_updates(should_pause)
         return StepResult({0: ended}, {}) if ended else NOTHING_HAPPENED
 
     def make_updates(self, should_pause: Callable[[], bool] = never) -> None:

@@ -131,8 +131,8 @@ class Session:
             writer = self.writers[run]
             yield run, Started(writer.folder, writer.resumed_at_step, tuple(writer.notes))
         runs = self.engine.runs
+        in_round = self._in_round()
         while True:
-            in_round = self._in_round()
             try:
                 if not in_round and (due := [run for run in self.active if runs[run].evaluation_due()]):
                     yield from self._evaluate(due)
@@ -154,6 +154,10 @@ class Session:
                 for run in self.active:
                     yield run, self.writers[run].progress()
             yield from self._step(in_round)
+            in_round = self._in_round()
+            if not in_round:
+                for run in [run for run in self.active if runs[run].window_is_full()]:
+                    yield from self._log_updates(run)
 
     def _save_is_due(self) -> bool:
         return self.requests.save or time.monotonic() - self.last_save > self.checkpoint_seconds
@@ -189,12 +193,6 @@ class Session:
             for episode in episodes:
                 for event in self.writers[run].log_episode(episode):
                     yield run, event
-        if self._in_round():
-            return
-        for run in tuple(self.active):
-            state = self.engine.runs[run]
-            if state.window_size >= state.config.training.log_interval:
-                yield from self._log_updates(run)
 
     def _log_updates(self, run: int) -> Told:
         self.engine.deliver_metrics()

@@ -59,8 +59,8 @@ def keep_freed_memory() -> None:
 def collect_cycles_rarely() -> None:
     """Let Python look for unreachable cycles once in 50,000 new objects, in place of 700.
 
-    Each look walks through the many thousand objects that JAX keeps, some 2 % of the samples that `perf record` took of a
-    training on HalfCheetah-v4; a step makes no cycle.
+    Each look walks through the many thousand objects that JAX keeps, some 2 % of the samples that `perf record` took of
+    a training on HalfCheetah-v4; a step makes no cycle.
     """
     _, *older = gc.get_threshold()
     gc.set_threshold(50_000, *older)

@@ -119,29 +119,20 @@ class RunState:
 
     def finish_reason(self) -> str | None:
         """Why the run is at its end, or None if it is not."""
-        training, counters = self.config.training, self.counters
-        for name, done in (("steps", counters.steps), ("updates", counters.updates), ("episodes", counters.episodes)):
-            limit = getattr(training, f"max_{name}")
-            if limit is not None and done >= limit:
+        counters = self.counters
+        for name, limit in self.config.training.limits.items():
+            if getattr(counters, name) >= limit:
                 return f"max_{name} = {limit} reached"
-        patience = training.patience_episodes
+        patience = self.config.training.patience_episodes
         if patience is not None and counters.episodes - counters.best_at_episode >= patience:
             return f"no better evaluation return for patience_episodes = {patience}"
         return None
 
     def fraction_done(self) -> float:
         """The share of the run that is done, by the nearest of its limits, patience aside."""
-        training, counters = self.config.training, self.counters
-        shares = [
-            done / limit
-            for done, limit in (
-                (counters.steps, training.max_steps),
-                (counters.updates, training.max_updates),
-                (counters.episodes, training.max_episodes),
-            )
-            if limit is not None
-        ]
-        return min(1.0, max(shares))
+        limits = self.config.training.limits
+        nearest: float = max(getattr(self.counters, name) / limit for name, limit in limits.items())
+        return min(1.0, nearest)
 
     # --- the window of metrics
 
@@ -149,6 +140,10 @@ class RunState:
     def window_size(self) -> int:
         """Updates since the last line of metrics.jsonl, those that are not yet delivered counted in."""
         return self.counters.updates - self.logged_updates
+
+    def window_is_full(self) -> bool:
+        """Whether a line of metrics.jsonl is due."""
+        return self.window_size >= self.config.training.log_interval
 
     def window_array(self) -> np.ndarray:
         """The window's metrics f32[updates, M].

@@ -15,6 +15,12 @@ stage_2_seeds=${3:-3}
 # jaxlib 0.10.2 can compile large matrix products wrongly through these fusions (jax issue 39103): not used here.
 export XLA_FLAGS="--xla_cpu_experimental_ynn_fusion_type="
 
+# Linux weighs sessions against each other before it weighs processes, so nice gives way only within its own: started
+# as a session of its own (setsid examples/averaging/run.sh RUNS &), this one gives way as a whole.
+if [[ $(ps -o sid= -p $$) -eq $$ ]]; then
+  { echo 19 >/proc/self/autogroup; } 2>/dev/null || true
+fi
+
 half_cheetah() {  # name, variant and settings of an arm; the slow arms first, so that the two workers end together
   cat <<'ARMS'
 averaged averaged

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -68,8 +68,8 @@ class Parts(NamedTuple):
         def trained(row: jax.Array, key: jax.Array) -> Array:
             return self.q_network.train(row, state, action, key=key)[0]
 
-        each = jax.vmap({"evaluation": evaluated, "training": trained}[self.settings.critic_mode_for_actor])
-        outputs: jax.Array = each(critic, jax.random.split(key, len(critic)))
+        one = {"evaluation": evaluated, "training": trained}[self.settings.critic_mode_for_actor]
+        outputs: jax.Array = of_each(one, critic, jax.random.split(key, len(critic)))
         return outputs
 
     def chosen_critics(self, key: jax.Array) -> jax.Array | slice:
@@ -155,6 +155,9 @@ def take_moments(state: LearnerState, batch: Batch, context: Context) -> Learner
 FOR_NETWORKS = 1  # folded into the key of a noise, it is that of the networks that draw something while they learn
 FOR_CRITICS = 2  # likewise: of the critics in the policy's loss
 FOR_CHOICE = 3  # likewise: of the critics that value the next state
+WRITTEN_OUT = 2
+"""Most critics whose passes the compiled program holds one by one; more would take the compiler too long."""
+Result = TypeVar("Result")
 Passes = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 Update = Callable[[Parts, Scalars, LearnerState, Batch, Context, jax.Array], LearnerState]
 
@@ -217,10 +220,9 @@ def forward(
     now = jnp.concatenate([batch.observation, batch.action], axis=1)  # in one array: no gradient of the action is due
     then = jnp.concatenate([batch.next_observation, next_action], axis=1)
 
-    def train(critic: jax.Array, inputs: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return parts.q_network.train(critic, inputs, key=key)
+    def passes(critics: jax.Array, inputs: jax.Array, keys: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return of_each(lambda critic, key: parts.q_network.train(critic, inputs, key=key), critics, keys)
 
-    passes: Passes = jax.vmap(train, in_axes=(0, None, 0))  # each network draws its own
     of_targets: Passes = jax.vmap(passes, in_axes=(0, None, 0))
     own_keys, target_keys = jax.random.split(key, len(critic)), split_for(key, max(1, len(targets)), targets.shape[1])
     if not parts.settings.joint_forward:
@@ -234,6 +236,18 @@ def forward(
     else:
         next_outputs = outputs[None, chosen, size:]
     return outputs[:, :size], next_outputs, statistics
+
+
+def of_each(function: Callable[[jax.Array, jax.Array], Result], critics: jax.Array, keys: jax.Array) -> Result:
+    """What `function(critic f32[P], key u32[2])` gives for critics f32[C, P] and keys u32[C, 2], each result stacked.
+
+    A few critics are written out one after the other: that is faster than products of one batch (docs/speed.md).
+    """
+    if len(critics) > WRITTEN_OUT:
+        return jax.vmap(function)(critics, keys)
+    results = [function(critic, key) for critic, key in zip(critics, keys, strict=True)]
+    stacked: Result = jax.tree.map(lambda *parts: jnp.stack(parts), *results)
+    return stacked
 
 
 def split_for(key: jax.Array, snapshots: int, critics: int) -> jax.Array:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from saclab.errors import TrainingFailed
 from saclab.records import JSON_BYTES, Damaged, Formatted, Manifest, Unreadable, from_json, read_bytes
 
-FORMAT, OLDEST_FORMAT = 3, 1
+FORMAT, OLDEST_FORMAT = 4, 1
 MANIFEST, MANIFEST_CHECKSUM = "manifest.json", "manifest.sha256"
 SAFE_FILE = re.compile(r"[a-z]+(-\d{4,})?\.safetensors")
 CHECKPOINT_NAME = re.compile(r"step-(\d{12,})(?:-update-(\d{12,})|(-untested))?")

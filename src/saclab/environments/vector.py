@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +10,8 @@ import numpy as np
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.reward_terms import split_reward
 from saclab.errors import NonFiniteError, RunBroken
+
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Transitions(NamedTuple):
@@ -70,10 +71,6 @@ class TrainingEnvironments:
             NonFiniteError: if an environment gives an observation or a reward that is not finite.
             RunBroken: if one breaks its word or raises an error.
         """
-        with np.errstate(over="ignore"):  # what is beyond 32 bits is refused as not finite
-            return self._step(action)
-
-    def _step(self, action: np.ndarray) -> tuple[Transitions, list[EndedEpisode]]:
         observation = self.observation.copy()
         reward_terms = np.zeros((len(self), len(self.reward_terms) + 1), np.float32)
         next_observation = np.empty_like(observation)
@@ -82,8 +79,8 @@ class TrainingEnvironments:
         scaled = self.spec.scale_action(action)
         for index, environment in enumerate(self.environments):
             seen, reward, ends, cut, info = environment.step(scaled[index])
+            self._require_finite(index, seen, reward, scaled[index])
             next_observation[index], reward_terms[index, -1], terminated[index] = seen, reward, ends
-            self._require_finite(index, next_observation[index], float(reward_terms[index, -1]), scaled[index])
             if self.reward_terms:
                 reward_terms[index] = split_reward(self.name, reward, info, self.reward_terms)
             self.total_rewards[index] += reward
@@ -132,13 +129,17 @@ class TrainingEnvironments:
         return EndedEpisode(index, float(self.total_rewards[index]), int(self.lengths[index]), terminated)
 
     def _start_episode(self, index: int, seed: int | None = None) -> None:
-        self.observation[index] = self.environments[index].reset(seed)
         self.total_rewards[index], self.lengths[index] = 0.0, 0
-        self._require_finite(index, self.observation[index], 0.0, np.zeros(0, np.float32))
+        seen = self.environments[index].reset(seed)
+        self._require_finite(index, seen, 0.0, np.zeros(0, np.float32))
+        self.observation[index] = seen
 
-    def _require_finite(self, index: int, observation: np.ndarray, reward: float, action: np.ndarray) -> None:
-        if math.isfinite(reward) and np.isfinite(observation).all():
+    def _require_finite(self, index: int, seen: np.ndarray, given: float, action: np.ndarray) -> None:
+        """Refuse an observation and a reward that 32 bits cannot hold."""
+        if abs(given) <= LARGEST and np.abs(seen).max(initial=0) <= LARGEST:
             return
+        with np.errstate(over="ignore"):
+            observation, reward = seen.astype(np.float32), float(np.float32(given))
         broken = np.flatnonzero(~np.isfinite(observation)).tolist()
         what = f"observation entries {broken[:10]}" if broken else f"reward {reward}"
         raise NonFiniteError(

@@ -114,6 +114,8 @@ INITIALISATIONS: dict[str, Callable[[jax.Array, int, int], jax.Array]] = {
 
 def product(inputs: tuple[Array, ...], weights: Array) -> Array:
     """[input_1, input_2, …] @ weights, without putting the inputs into one array."""
+    if len(inputs) == 1:
+        return inputs[0] @ weights
     ends = accumulate(part.shape[-1] for part in inputs)
     return reduce(add, (part @ weights[end - part.shape[-1] : end] for part, end in zip(inputs, ends, strict=True)))
 

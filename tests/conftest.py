@@ -180,8 +180,8 @@ def make_case(settings: AlgorithmSettings) -> Case:
     return Case(settings, learner, scalars(settings, ACTION_SIZE, planned_updates=10), compiled, traces)
 
 
-DEAREST = "simbav2/hyperspherical", "flashsac/batch_norm_residual"
-"""Cases that compile for many seconds; their networks are fast cases of tests/reference/test_blocks.py."""
+DEAREST = "simbav2/hyperspherical", "flashsac/batch_norm_residual", "xqc/batch_norm_mlp"
+"""Cases that compile for many seconds; their networks are fast cases of test_blocks.py and test_batch_norm.py."""
 
 
 def as_parameters(cases: dict[str, AlgorithmSettings]) -> list[Any]:

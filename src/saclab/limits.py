@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping
 from saclab.errors import SettingError
 
 SMALLEST_FLOAT, LARGEST_FLOAT = 1.2e-38, 3.4e38
-"""Of 32-bit numbers, without loss."""
+"""The range of 32-bit numbers, without loss."""
 LARGEST_INDEX, LARGEST_COUNT = 2**31 - 1, 2**53
-"""Of what is compiled, and of what is counted."""
+"""The largest of what is compiled, and of what is counted."""
 MOST = {
     "parallel_environments": 100_000,
     "evaluation_episodes": 100_000,

@@ -66,7 +66,7 @@ class FileRecord(Struct, omit_defaults=True):
     sha256: Sha256 | None = None
     """None where an earlier saclab recorded the size only."""
     version: int | None = None
-    """Of a segment of the replay buffer: what it holds."""
+    """What a segment of the replay buffer holds; None for other files."""
 
 
 class Formatted(Struct):
@@ -128,7 +128,7 @@ class PolicyDescription(Struct, omit_defaults=True):
     algorithm: dict[str, Any]
     """AlgorithmSettings."""
     mean_return: float | None = None
-    """Of the evaluation that found it the best."""
+    """That of the evaluation that found it the best."""
     episode: Count | None = None
     """Training episodes until then."""
 

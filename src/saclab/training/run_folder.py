@@ -57,7 +57,7 @@ LONGEST_NAME = 200
 FAILURE = "failure"
 """Folder with what led to a run's end, if it came to a bad one."""
 EVALUATION_TYPES = {"return_": float, "length_": Count}
-"""Of the numbered columns of evaluations.csv."""
+"""The start of the numbered columns' names in evaluations.csv -> the type of their values."""
 ROUNDED = 1e-4
 """What is computed from logs may differ from what is recorded by such a share: logs may be rounded to five digits."""
 

@@ -60,7 +60,7 @@ class EnvironmentState(Struct):
     """What `capture_state` gives of an environment beside its arrays, and its episode so far."""
 
     elapsed_steps: list[Count]
-    """Of each time limit."""
+    """The steps that each time limit has counted."""
     generator: dict[str, Any]
     """`bit_generator.state` of whatever generator it has."""
     total_reward: float

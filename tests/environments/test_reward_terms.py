@@ -21,7 +21,7 @@ def test_a_term_that_is_not_told_is_named_with_those_that_are():
         split_reward("Some-v0", 1.0, {"forward": 2.0, "position": np.zeros(3)}, ("walking",))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
 def test_a_term_that_is_not_finite_is_named(value):
     with pytest.raises(NonFiniteError, match="reward term forward"):
         split_reward("Some-v0", 1.0, {"forward": value}, ("forward",))

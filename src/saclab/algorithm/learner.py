@@ -156,7 +156,7 @@ FOR_NETWORKS = 1  # folded into the key of a noise, it is that of the networks t
 FOR_CRITICS = 2  # likewise: of the critics in the policy's loss
 FOR_CHOICE = 3  # likewise: of the critics that value the next state
 WRITTEN_OUT = 2
-"""Most critics whose passes the compiled program holds one by one; more would take the compiler too long."""
+"""Most critics whose passes the compiled program holds one by one; with more it was not tried."""
 Result = TypeVar("Result")
 Passes = Callable[[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 Update = Callable[[Parts, Scalars, LearnerState, Batch, Context, jax.Array], LearnerState]

@@ -8,6 +8,7 @@ from typing import Any, SupportsFloat
 import numpy as np
 
 from saclab.errors import NonFiniteError, SettingError
+from saclab.limits import LARGEST_FLOAT
 
 
 def split_reward(
@@ -23,7 +24,7 @@ def split_reward(
 
     Raises:
         SettingError: if the step does not tell a term.
-        NonFiniteError: if a term is not finite.
+        NonFiniteError: if a term is more than 32 bits can hold, or not a number.
     """
     terms = []
     for name in names:
@@ -33,6 +34,6 @@ def split_reward(
                 "reward_terms", name, f"{environment} does not tell it in the info of a step: it tells {known}"
             )
         terms.append(float(info[name]))
-        if not np.isfinite(terms[-1]):
+        if not abs(terms[-1]) <= LARGEST_FLOAT:
             raise NonFiniteError(f"{environment} gave the reward term {name} = {terms[-1]}")
     return *terms, float(reward) - sum(terms)

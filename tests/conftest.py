@@ -181,7 +181,7 @@ def make_case(settings: AlgorithmSettings) -> Case:
 
 
 DEAREST = "simbav2/hyperspherical", "flashsac/batch_norm_residual", "xqc/batch_norm_mlp"
-"""Cases that compile for many seconds; their networks are fast cases of test_blocks.py and test_batch_norm.py."""
+"""Cases that compile for many seconds; their networks are fast cases of reference/test_networks.py."""
 
 
 def as_parameters(cases: dict[str, AlgorithmSettings]) -> list[Any]:

@@ -1,8 +1,8 @@
-"""Soft Actor-Critic written straight from the paper's equations in 64-bit NumPy: every gradient by hand.
+"""Soft Actor-Critic written straight from the paper's equations in 64-bit NumPy: every gradient of a loss by hand.
 
-It shares no code with saclab but the names of the settings, and is laid out otherwise where it can be: parameters are
-lists of (weights, bias), the targets of the past are a list that only grows, and noise is handed in. It is slow and
-plain on purpose.
+It shares no code with saclab but the names of the settings, and is laid out otherwise where it can be: each critic is a
+vector of its own, the targets of the past are a list that only grows, and noise is handed in. It is slow and plain on
+purpose. `numpy_networks.py` has the networks.
 """
 
 from __future__ import annotations
@@ -10,38 +10,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from saclab.settings import AlgorithmSettings
-
-Layers = list[tuple[np.ndarray, np.ndarray]]
-"""Weights [inputs, outputs] and bias [outputs] of each layer."""
-
-
-def forward(layers: Layers, x: np.ndarray, masks: None = None) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Output of a ReLU perceptron, and the input of each layer. It has no dropout, so no masks."""
-    inputs = []
-    for number, (weights, bias) in enumerate(layers):
-        inputs.append(x)
-        x = x @ weights + bias
-        if number < len(layers) - 1:
-            x = np.maximum(x, 0.0)
-    return x, inputs
-
-
-def backward(layers: Layers, inputs: list[np.ndarray], d_output: np.ndarray) -> tuple[Layers, np.ndarray]:
-    """Gradients of the layers and of the network's input."""
-    gradients: Layers = []
-    for number in reversed(range(len(layers))):
-        weights, _ = layers[number]
-        gradients.insert(0, (inputs[number].T @ d_output, d_output.sum(axis=0)))
-        d_output = d_output @ weights.T
-        if number > 0:
-            d_output = d_output * (inputs[number] > 0)
-    return gradients, d_output
 
 
 @dataclass
@@ -52,31 +26,18 @@ class Adam:
     betas: tuple[float, float] = (0.9, 0.999)
     share: Callable[[int], float] = lambda step: 1.0
     """What is left of the learning rate after so many steps."""
-    first: list[np.ndarray] = field(default_factory=list)
-    second: list[np.ndarray] = field(default_factory=list)
+    first: np.ndarray | float = 0.0
+    second: np.ndarray | float = 0.0
     count: int = 0
 
-    def step(self, parameters: list[np.ndarray], gradients: list[np.ndarray]) -> list[np.ndarray]:
-        if not self.first:
-            self.first = [np.zeros_like(p) for p in parameters]
-            self.second = [np.zeros_like(p) for p in parameters]
-        rate = self.learning_rate * self.share(self.count)
+    def step(self, parameters: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        rate, (a, b) = self.learning_rate * self.share(self.count), self.betas
         self.count += 1
-        changed, (a, b) = [], self.betas
-        for i, (parameter, gradient) in enumerate(zip(parameters, gradients, strict=True)):
-            self.first[i] = a * self.first[i] + (1 - a) * gradient
-            self.second[i] = b * self.second[i] + (1 - b) * gradient**2
-            mean = self.first[i] / (1 - a**self.count)
-            variance = self.second[i] / (1 - b**self.count)
-            changed.append(parameter - rate * mean / (np.sqrt(variance) + 1e-8))
-        return changed
-
-    def step_layers(self, layers: Layers, gradients: Layers) -> Layers:
-        return paired(self.step([x for layer in layers for x in layer], [x for layer in gradients for x in layer]))
-
-
-def paired(flat: list[np.ndarray]) -> Layers:
-    return list(zip(flat[::2], flat[1::2], strict=True))
+        self.first = a * self.first + (1 - a) * gradient
+        self.second = b * self.second + (1 - b) * gradient**2
+        mean = self.first / (1 - a**self.count)
+        variance = self.second / (1 - b**self.count)
+        return parameters - rate * mean / (np.sqrt(variance) + 1e-8)
 
 
 def schedule(kind: str, last: float, steps: int) -> Callable[[int], float]:
@@ -219,26 +180,22 @@ class NumpySac:
 
     def __init__(
         self,
-        actor: Layers,
-        critics: list[Layers],
+        networks: tuple[Any, Any],
+        actor: np.ndarray,
+        critics: list[np.ndarray],
         settings: AlgorithmSettings,
         target_entropy: float,
         updates: int,
-        critic_network: Any = None,
     ) -> None:
-        """`updates` is the length of the learning rates' schedule; `critic_network` a module with `forward` and
-        `backward`, if the critics are no perceptrons.
-        """
-        self.critic_forward = critic_network.forward if critic_network else forward
-        self.critic_backward = critic_network.backward if critic_network else backward
+        """`networks` are the actor's and each critic's; `updates` is the length of the learning rates' schedule."""
+        self.actor_network, self.critic_network = networks
         self.actor, self.critics, self.settings = actor, critics, settings
         self.log_alpha = math.log(settings.initial_temperature)
         self.target_entropy = target_entropy
-        self.log_std_range = settings.log_std_minimum, settings.log_std_maximum
         atoms, bound = settings.critic_atoms, settings.critic_bound
         heads = {"scalar": ScalarHead, "categorical": lambda: CategoricalHead(atoms, bound)}
         self.head = (heads | {"quantile": lambda: QuantileHead(atoms)})[settings.critic_head]()
-        self.targets: list[list[Layers]] = [critics]
+        self.targets: list[list[np.ndarray]] = [critics]
         """The target critics after 0, 1, 2, … updates."""
         window = settings.entropy_window
         self.entropy_terms = deque([np.zeros(settings.batch_size)] * window, maxlen=window)
@@ -250,7 +207,7 @@ class NumpySac:
         self.report: dict[str, float] = {}
         self.updates = 0
 
-    def averaged_targets(self) -> list[list[Layers]]:
+    def averaged_targets(self) -> list[list[np.ndarray]]:
         """The K target critics of Eq. 9: the present one, then those left behind, newest first.
 
         One is left behind at every `snapshot_interval`-th update, as it was before that update; before there are
@@ -263,17 +220,20 @@ class NumpySac:
         left_behind = [(marks - back) * interval - 1 for back in range(count - 1)]
         return [self.targets[-1]] + [self.targets[max(0, when)] for when in left_behind]
 
-    def sample(self, observation: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple]:
-        """Actions, log-densities, and what the backward pass needs (Appendix A)."""
-        output, inputs = forward(self.actor, observation)
+    def sample(self, output: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Actions, log-densities, log deviations, and how these change with the network's outputs (Appendix A)."""
         mean, raw = np.split(output, 2, axis=1)
-        log_std = np.clip(raw, *self.log_std_range)
+        low, high = self.settings.log_std_minimum, self.settings.log_std_maximum
+        if self.settings.log_std_bounding == "clip":
+            log_std, slope = np.clip(raw, low, high), (raw > low) & (raw < high)
+        else:
+            log_std = low + (high - low) * (np.tanh(raw) + 1) / 2
+            slope = (high - low) / 2 / np.cosh(raw) ** 2
         u = mean + np.exp(log_std) * noise
         action = np.tanh(u)
         gaussian = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
-        log_prob = (gaussian - np.log(1 - action**2)).sum(axis=1)
-        inside = (raw > self.log_std_range[0]) & (raw < self.log_std_range[1])
-        return action, log_prob, (inputs, log_std, inside)
+        log_prob = (gaussian + 2 * np.log(np.cosh(u))).sum(axis=1)  # d tanh u / du = 1 / cosh² u
+        return action, log_prob, log_std, slope
 
     def update(
         self,
@@ -291,7 +251,7 @@ class NumpySac:
             if part == "critic":
                 self.update_critic(observation, action, reward, next_observation, terminated, draws)
             if part == "actor" and acts:
-                self.update_actor(observation, draws)
+                self.update_actor(observation, next_observation, draws)
             if part == "temperature" and acts:
                 self.update_temperature()
             if part == "targets":
@@ -300,30 +260,35 @@ class NumpySac:
         return self.report
 
     def update_critic(self, observation, action, reward, next_observation, terminated, draws) -> None:
+        settings, network = self.settings, self.critic_network
         # Eq. 4 and 9: the value of the next state.
-        next_action, next_log_prob, _ = self.sample(next_observation, draws.next_noise)
+        acts = self.actor_network.forward(self.actor, next_observation, learns=False)
+        next_action, next_log_prob, *_ = self.sample(acts.outputs, draws.next_noise)
+        now, then = np.hstack([observation, action]), np.hstack([next_observation, next_action])
+        rows, joint = len(now), settings.joint_forward
         values = []
         for target in self.averaged_targets():
+            seen = np.vstack([now, then]) if joint else then
             outputs = [
-                self.critic_forward(target[i], np.hstack([next_observation, next_action]), masks)[0]
+                network.forward(target[i], seen, True, masks).outputs[-rows:]
                 for i, masks in zip(draws.chosen, draws.target_masks, strict=True)
             ]
             predictions = np.array([self.head.predict(output) for output in outputs])
             q = np.array([self.head.q(output) for output in outputs])
-            values.append(reduced(self.settings.target_reduction, predictions, q, self.settings.dropped_quantiles))
+            values.append(reduced(settings.target_reduction, predictions, q, settings.dropped_quantiles))
         prediction = sum(values) / len(values)
         self.entropy_terms.append(math.exp(self.log_alpha) * next_log_prob)
         entropy_term = sum(self.entropy_terms) / len(self.entropy_terms)
-        y = self.head.target(prediction, reward, self.settings.discount * (1 - terminated), entropy_term)
+        y = self.head.target(prediction, reward, settings.discount * (1 - terminated), entropy_term)
 
-        # Eq. 3: each critic towards y.
+        # Eq. 3: each critic towards y. Rows of the next state in the same pass only count for its statistics.
         critic_loss, predicted, changed = 0.0, [], []
-        for layers, adam, masks in zip(self.critics, self.critic_adams, draws.critic_masks, strict=True):
-            outputs, kept = self.critic_forward(layers, np.hstack([observation, action]), masks)
-            loss, d_outputs = self.head.loss(outputs, y)
-            gradients, _ = self.critic_backward(layers, kept, d_outputs)
-            changed.append(adam.step_layers(layers, gradients))
-            predicted.append(self.head.q(outputs))
+        for critic, adam, masks in zip(self.critics, self.critic_adams, draws.critic_masks, strict=True):
+            learns = network.forward(critic, np.vstack([now, then]) if joint else now, True, masks)
+            loss, d_outputs = self.head.loss(learns.outputs[:rows], y)
+            gradient = learns.gradient(padded(d_outputs, len(learns.outputs)))
+            changed.append(stepped(network, adam, critic, gradient, learns.statistics))
+            predicted.append(self.head.q(learns.outputs[:rows]))
             critic_loss += loss
         self.critics = changed
         self.report |= {
@@ -334,28 +299,30 @@ class NumpySac:
             "snapshot_spread": np.mean(np.std([self.head.q_of_prediction(one) for one in values], axis=0)),
         }
 
-    def update_actor(self, observation, draws) -> None:
+    def update_actor(self, observation, next_observation, draws) -> None:
         # Eq. 5 on the critics as they are now: the actor, through the reparametrised action.
-        batch, alpha, noise = len(observation), math.exp(self.log_alpha), draws.actor_noise
-        sampled, log_prob, (inputs, log_std, inside) = self.sample(observation, noise)
+        rows, alpha, noise = len(observation), math.exp(self.log_alpha), draws.actor_noise
+        seen = np.vstack([observation, next_observation]) if self.settings.actor_joint_forward else observation
+        learns = self.actor_network.forward(self.actor, seen, learns=True)
+        sampled, log_prob, log_std, slope = self.sample(learns.outputs[:rows], noise)
+        critics_learn = self.settings.critic_mode_for_actor == "training"
         passes = [
-            self.critic_forward(layers, np.hstack([observation, sampled]), masks)
-            for layers, masks in zip(self.critics, draws.actor_masks, strict=True)
+            self.critic_network.forward(critic, np.hstack([observation, sampled]), critics_learn, masks)
+            for critic, masks in zip(self.critics, draws.actor_masks, strict=True)
         ]
-        q = np.array([self.head.q(output) for output, _ in passes])
+        q = np.array([self.head.q(each.outputs) for each in passes])
         if self.settings.actor_reduction == "minimum":
             share = (np.arange(len(q))[:, None] == q.argmin(axis=0)).astype(float)
         else:
             share = np.full_like(q, 1 / len(q))
         d_action = np.zeros_like(sampled)
-        for layers, (outputs, kept), weight in zip(self.critics, passes, share, strict=True):
-            d_outputs = -weight[:, None] / batch * self.head.d_q(outputs)
-            _, d_input = self.critic_backward(layers, kept, d_outputs)
-            d_action += d_input[:, observation.shape[1] :]
-        d_u = d_action * (1 - sampled**2) + alpha / batch * 2 * sampled  # d log π / du = 2 tanh u
-        d_log_std = (d_u * np.exp(log_std) * noise - alpha / batch) * inside
-        gradients, _ = backward(self.actor, inputs, np.hstack([d_u, d_log_std]))
-        self.actor = self.actor_adam.step_layers(self.actor, gradients)
+        for each, weight in zip(passes, share, strict=True):
+            d_outputs = -weight[:, None] / rows * self.head.d_q(each.outputs)
+            d_action += each.input_gradient(d_outputs)[:, observation.shape[1] :]
+        d_u = d_action * (1 - sampled**2) + alpha / rows * 2 * sampled  # d log π / du = 2 tanh u
+        d_raw = (d_u * np.exp(log_std) * noise - alpha / rows) * slope
+        gradient = learns.gradient(padded(np.hstack([d_u, d_raw]), len(seen)))
+        self.actor = stepped(self.actor_network, self.actor_adam, self.actor, gradient, learns.statistics)
         self.report["actor_loss"] = np.mean(alpha * log_prob - (share * q).sum(axis=0))
         self.report["entropy"] = -np.mean(log_prob)
 
@@ -368,16 +335,21 @@ class NumpySac:
         on_alpha = self.settings.temperature_gradient == "alpha"
         self.report["temperature_loss"] = (alpha if on_alpha else self.log_alpha) * excess
         gradient = alpha * excess if on_alpha else excess  # both with respect to log α
-        (self.log_alpha,) = self.temperature_adam.step([np.array(self.log_alpha)], [np.array(gradient)])
+        self.log_alpha = self.temperature_adam.step(self.log_alpha, gradient)
 
     def update_targets(self) -> None:
         # Eq. 2: the target moves towards the changed critics.
         rate = self.settings.polyak_rate
-        moved = []
-        for target, critic in zip(self.targets[-1], self.critics):
-            layers = [
-                tuple((1 - rate) * old + rate * new for old, new in zip(before, now))
-                for before, now in zip(target, critic)
-            ]
-            moved.append(layers)
-        self.targets.append(moved)
+        pairs = zip(self.targets[-1], self.critics, strict=True)
+        self.targets.append([(1 - rate) * target + rate * critic for target, critic in pairs])
+
+
+def padded(rows: np.ndarray, count: int) -> np.ndarray:
+    """With rows of zeros behind them, `count` in all."""
+    return np.vstack([rows, np.zeros((count - len(rows), rows.shape[1]))])
+
+
+def stepped(network: Any, adam: Adam, vector: np.ndarray, gradient: np.ndarray, statistics: np.ndarray) -> np.ndarray:
+    """A network's vector after a step of Adam, its projection, and with the running statistics that follow."""
+    vector = network.project(adam.step(vector, gradient))
+    return np.concatenate([vector[: len(vector) - len(statistics)], statistics])

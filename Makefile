@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 PEERS := .venv-peers
 
-.PHONY: quickstart test test-slow fuzz check lint format types benchmark clean
+.PHONY: quickstart test test-slow peers fuzz check lint format types benchmark clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
@@ -15,6 +15,8 @@ test: $(VENV)/installed  ## the fast tests
 
 test-slow: $(VENV)/installed  ## learning to a threshold, long kill-and-resume
 	$(BIN)/python -m pytest -n auto --dist loadfile -m slow
+
+peers: $(PEERS)/installed  ## the other libraries, for `make benchmark` and for a slow test that compares updates with one
 
 fuzz: $(VENV)/installed  ## look for damage and misuse that is not told of, for as long as it takes
 	SACLAB_FUZZ=long $(BIN)/python -m pytest -m "slow or not slow" tests/fuzz

@@ -82,17 +82,21 @@ class LayerNormPerceptron(Perceptron):
     multiplied by.
     """
 
+    def affine(self, vector: np.ndarray) -> list[np.ndarray]:
+        """Scale and shift of each normalisation, f64[2, W]."""
+        widths = self.sizes[1:-1]
+        pairs = np.split(vector[-2 * sum(widths) :], np.cumsum(widths)[:-1] * 2)
+        return [pair.reshape(2, -1) for pair in pairs]
+
     def forward(self, vector: np.ndarray, x: np.ndarray, learns: bool, masks: list[np.ndarray] | None = None) -> Pass:
         *hidden, (last, last_bias) = self.unpack(vector)
-        widths = self.sizes[1:-1]
-        affine = np.split(vector[-2 * sum(widths) :], np.cumsum(np.repeat(widths, 2))[:-1])
-        kept = []
+        affine, kept = self.affine(vector), []
         for number, (weights, bias) in enumerate(hidden):
             mask = 1.0 if masks is None else masks[number]
             dropped = (x @ weights + bias) * mask
             deviation = np.sqrt(dropped.var(axis=1, keepdims=True) + 1e-5)
             normal = (dropped - dropped.mean(axis=1, keepdims=True)) / deviation
-            after = normal * affine[2 * number] + affine[2 * number + 1]
+            after = normal * affine[number][0] + affine[number][1]
             kept.append((x, mask, deviation, normal, after > 0))
             x = np.maximum(after, 0.0)
 
@@ -103,7 +107,7 @@ class LayerNormPerceptron(Perceptron):
                 below, mask, deviation, normal, alive = kept[number]
                 d = d * alive
                 slopes[:0] = [(d * normal).sum(axis=0), d.sum(axis=0)]
-                d = d * affine[2 * number]
+                d = d * affine[number][0]
                 d = d - d.mean(axis=1, keepdims=True) - normal * (d * normal).mean(axis=1, keepdims=True)
                 d = d / deviation * mask
                 dense[:0] = [below.T @ d, d.sum(axis=0)]

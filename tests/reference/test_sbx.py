@@ -112,10 +112,8 @@ def answer_of_sbx(folder: Path, algorithm: str, settings, request: dict) -> dict
     if algorithm != "CrossQ":
         chosen["tau"] = settings.polyak_rate
     if algorithm == "TQC":
-        chosen["policy_kwargs"] |= {
-            "n_quantiles": settings.critic_atoms,
-            "top_quantiles_to_drop_per_net": settings.dropped_quantiles,
-        }
+        chosen["policy_kwargs"]["n_quantiles"] = settings.critic_atoms
+        chosen["top_quantiles_to_drop_per_net"] = settings.dropped_quantiles
     if settings.network_of_critic == "layer_norm_mlp":
         chosen["policy_kwargs"]["layer_norm"] = True
     np.savez(folder / "request.npz", algorithm=algorithm, settings=json.dumps(chosen), **request)

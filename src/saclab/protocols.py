@@ -56,6 +56,25 @@ PROTOCOLS: dict[str, Protocol] = {
             log_interval=1000,
         ),
     ),
+    "fast": Protocol(
+        "A good policy in little time on a CPU: standard with batches of 64 and learning rates of 2e-3, found for "
+        "sac-auto on HalfCheetah-v4. What it reaches in the end was not compared.",
+        TrainingSettings(
+            random_steps=5_000,
+            update_interval=1,
+            replay_capacity=1_000_000,
+            max_steps=200_000,
+            evaluation_interval_steps=5_000,
+            evaluation_episodes=5,
+            log_interval=1000,
+        ),
+        algorithm={
+            "batch_size": 64,
+            "actor_learning_rate": 2e-3,
+            "critic_learning_rate": 2e-3,
+            "temperature_learning_rate": 2e-3,
+        },
+    ),
     "quick": Protocol(
         "Minutes instead of hours, to see every part at work: smaller batches and larger steps than the others, and "
         "too short to judge a variant by. A variant's own batches, layers, updates per step, random steps and "

@@ -1,0 +1,32 @@
+"""saclab as its own commands train, until an evaluation reaches a score."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from score_watch import ScoreJob, ScoreWatch
+
+from saclab.protocols import make_config
+from saclab.training.events import Evaluated
+from saclab.training.loop import train
+
+
+def main() -> None:
+    job = ScoreJob.from_command_line()
+    watch, settings = ScoreWatch(job), dict(job.settings)
+    variant, protocol = str(settings.pop("variant")), str(settings.pop("protocol"))
+    settings |= {
+        "max_steps": job.most_steps,
+        "max_updates": None,
+        "evaluation_interval_steps": job.evaluation_interval_steps,
+        "evaluation_episodes": job.evaluation_episodes,
+    }
+    config = make_config(job.environment, variant, protocol, job.seed, overrides=settings)
+    for event in train(config, Path(job.folder) / "run"):
+        if isinstance(event, Evaluated) and watch.evaluated(event.steps, float(event.total_rewards.mean())):
+            break
+    watch.report()
+
+
+if __name__ == "__main__":
+    main()

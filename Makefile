@@ -4,8 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 PEERS := .venv-peers
+SUITES := .venv-suites
 
-.PHONY: quickstart test test-slow peers fuzz check lint format types benchmark clean
+.PHONY: quickstart test test-slow peers suites fuzz check lint format types benchmark clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
@@ -17,6 +18,8 @@ test-slow: $(VENV)/installed  ## learning to a threshold, long kill-and-resume
 	$(BIN)/python -m pytest -n auto --dist loadfile -m slow
 
 peers: $(PEERS)/installed  ## the other libraries, for `make benchmark` and for a slow test that compares updates with one
+
+suites: $(SUITES)/installed  ## dm_control and gymnasium-robotics, for a slow test that trains on them
 
 fuzz: $(VENV)/installed  ## look for damage and misuse that is not told of, for as long as it takes
 	SACLAB_FUZZ=long $(BIN)/python -m pytest -m "slow or not slow" tests/fuzz
@@ -47,6 +50,13 @@ $(PEERS)/installed: benchmarks/peers.txt
 	$(PEERS)/bin/pip install --quiet --disable-pip-version-check --requirement benchmarks/peers.txt
 	touch $@
 
+$(SUITES)/installed: tests/environments/suites.txt requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(SUITES)
+	grep -v '^mujoco' requirements.lock > $(SUITES)/constraints.txt
+	$(SUITES)/bin/pip install --quiet --disable-pip-version-check --constraint $(SUITES)/constraints.txt \
+		--requirement tests/environments/suites.txt --editable '.[dev]'
+	touch $@
+
 $(VENV)/installed: requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --requirement requirements.lock
@@ -54,4 +64,4 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(PEERS) build dist src/*.egg-info
+	rm -rf $(VENV) $(PEERS) $(SUITES) build dist src/*.egg-info

@@ -82,10 +82,10 @@ def resume(
     Raises:
         UserError: if `run` is not a run folder, or its environment would import a package not named.
     """
-    from saclab.environments.make import require_import_allowed
+    from saclab.environments.wrappers import require_import_allowed
 
     config = read_config(Path(run))
-    require_import_allowed(config.environment, imports)
+    require_import_allowed(config.environment, config.training.wrappers, imports)
     return _train(config, Path(run), on_event, checkpoint_minutes)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,9 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from saclab.environments.checked import CheckedEnvironment
-from saclab.environments.make import EnvironmentSpec, require_import_allowed
+from saclab.environments.make import EnvironmentSpec
+from saclab.environments.wrappers import require_import_allowed
 from saclab.errors import RunBroken, UserError, require
 from saclab.files import absolute
+from saclab.records import PolicyDescription
 from saclab.trained_policy import TrainedPolicy, load_policy, read_description
 from saclab.training.evaluation import Evaluator
 from saclab.training.failure import tell_of_closing, tracebacks_in
@@ -50,10 +52,10 @@ def evaluate(
     require_seed(seed)
     policy, description = load_policy(run), read_description(run)
     run = absolute(run)
-    require_import_allowed(description.environment, imports)
+    require_import_allowed(description.environment, description.wrappers, imports)
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
     with tracebacks_in([run]):
-        evaluator = Evaluator(description.environment, description.environment_arguments)
+        evaluator = Evaluator(description.environment, description.environment_arguments, description.wrappers)
         try:
             require_fit(policy, description.environment, evaluator.spec)
             result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
@@ -91,10 +93,10 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
     require_seed(seed)
     policy, description = load_policy(run), read_description(run)
     run, given, video = absolute(run), video, absolute(video)
-    require_import_allowed(description.environment, imports)
+    require_import_allowed(description.environment, description.wrappers, imports)
     require_place(video)
     with tracebacks_in([run]):
-        environment = filmed_environment(description.environment, description.environment_arguments, size)
+        environment = filmed_environment(description, size)
         try:
             require_fit(policy, description.environment, environment.spec)
             environment.reset(seed)
@@ -136,17 +138,18 @@ def film_to(
     return filmed
 
 
-def filmed_environment(name: str, arguments: Mapping[str, Any], size: int) -> CheckedEnvironment:
-    """The environment with a camera of `size` × `size` pixels, or with its own where it cannot be told one.
+def filmed_environment(description: PolicyDescription, size: int) -> CheckedEnvironment:
+    """A policy's environment with a camera of `size` × `size` pixels, or with its own where it cannot be told one.
 
     Gymnasium's default camera stands still and the robot runs out of the picture: the one that MuJoCo's models call
     "track" follows it.
     """
-    view = {"camera_name": "track"} | dict(arguments) | {"width": size, "height": size}
+    name, arguments = description.environment, description.environment_arguments
+    view = {"camera_name": "track"} | arguments | {"width": size, "height": size}
     try:
-        return CheckedEnvironment(name, view, render_mode="rgb_array")
+        return CheckedEnvironment(name, view, "rgb_array", description.wrappers)
     except UserError:
-        return CheckedEnvironment(name, arguments, render_mode="rgb_array")
+        return CheckedEnvironment(name, arguments, "rgb_array", description.wrappers)
 
 
 def require_rendering(environment: CheckedEnvironment) -> None:

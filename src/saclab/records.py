@@ -131,6 +131,8 @@ class PolicyDescription(Struct, omit_defaults=True):
     """That of the evaluation that found it the best."""
     episode: Count | None = None
     """Training episodes until then."""
+    wrappers: tuple[str, ...] = ()
+    """Around the environment, the first one innermost."""
 
 
 class ReplayRecord(Struct):

@@ -151,9 +151,7 @@ class AlgorithmSettings:
     return, or the larger of it and the largest discounted return so far divided by `critic_bound`."""
 
     def __post_init__(self) -> None:
-        for name in field_names(type(self)):
-            if isinstance(value := getattr(self, name), list):  # as Python's users and JSON write them
-                object.__setattr__(self, name, tuple(value))
+        lists_to_tuples(self)
         require_representable(vars(self), plain_numbers())
         require_known(self, choices())
         require_ranges(self)
@@ -172,6 +170,9 @@ class AlgorithmSettings:
 class TrainingSettings:
     """How a run goes: how much experience, how many updates, when it is evaluated, when it stops."""
 
+    wrappers: tuple[str, ...] = ()
+    """What is put around the environment, the first one innermost: names of gymnasium.wrappers, such as
+    FlattenObservation, FlattenAction, or package.module:Name of your own, a class or a function of an environment."""
     parallel_environments: int = 1
     """Training environments stepped in turn. The update-to-data ratio does not depend on it: steps are counted
     over all environments."""
@@ -208,6 +209,7 @@ class TrainingSettings:
     """Updates that are averaged into one line of metrics.jsonl."""
 
     def __post_init__(self) -> None:
+        lists_to_tuples(self)
         require_representable(vars(self), ())
         positive = ("parallel_environments", "update_interval", "updates_per_interval", "replay_capacity",
                     "evaluation_episodes", "log_interval")  # fmt: skip
@@ -251,6 +253,13 @@ class TrainingSettings:
 
 
 Settings = TypeVar("Settings", AlgorithmSettings, TrainingSettings)
+
+
+def lists_to_tuples(settings: AlgorithmSettings | TrainingSettings) -> None:
+    """As Python's users and JSON write lists, for settings that are being made."""
+    for name in field_names(type(settings)):
+        if isinstance(value := getattr(settings, name), list):
+            object.__setattr__(settings, name, tuple(value))
 
 
 def field_names(settings: type[DataclassInstance]) -> tuple[str, ...]:

@@ -81,6 +81,7 @@ def save_policy(folder: Path, config: Config, spec: EnvironmentSpec, actor: np.n
         observation_size=spec.observation_size,
         action_size=spec.action_size,
         algorithm=dataclasses.asdict(config.algorithm),
+        wrappers=config.training.wrappers,
         **facts,
     )
     arrays = {"actor": actor, "action_low": spec.action_low, "action_high": spec.action_high}

@@ -53,13 +53,16 @@ class EnvironmentWorker:
         for share in task["shares"]:
             config = self.configs[share["run"]]
             environments = TrainingEnvironments(
-                config.environment, config.environment_arguments, share["seeds"], config.algorithm.reward_terms
-            )
+                config.environment, config.environment_arguments, share["seeds"], config.algorithm.reward_terms,
+                config.training.wrappers,
+            )  # fmt: skip
             rows = slice(share["first"], share["first"] + len(share["seeds"]))
             self.shares.append(Share(share["run"], rows, environments))
             self.buffers.observation[rows] = environments.observation
         any_config = next(iter(self.configs.values()))
-        self.evaluator = Evaluator(any_config.environment, any_config.environment_arguments)
+        self.evaluator = Evaluator(
+            any_config.environment, any_config.environment_arguments, any_config.training.wrappers
+        )
 
     def step(self) -> Message:
         """Step every active environment once; what went wrong in which run, and the numbers that belong to it."""

@@ -92,9 +92,9 @@ class Resume:
 
         config = read_config(self.run)
         limit_threads(self.threads or read_last_session(self.run).machine.threads)
-        from saclab.environments.make import require_import_allowed
+        from saclab.environments.wrappers import require_import_allowed
 
-        require_import_allowed(config.environment, self.imports)
+        require_import_allowed(config.environment, config.training.wrappers, self.imports)
         return train_and_show(config, self.run, self.checkpoint_minutes, console)
 
 

@@ -5,7 +5,7 @@ Every step of a training goes through here, so the way of an environment that ke
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -28,15 +28,21 @@ class CheckedEnvironment:
     Gymnasium environment gives.
     """
 
-    def __init__(self, name: str, arguments: Mapping[str, Any] | None = None, render_mode: str | None = None) -> None:
-        """Make it.
+    def __init__(
+        self,
+        name: str,
+        arguments: Mapping[str, Any] | None = None,
+        render_mode: str | None = None,
+        wrappers: Sequence[str] = (),
+    ) -> None:
+        """Make it, inside its wrappers.
 
         Raises:
             UserError: if it cannot be made or trained on.
         """
         self.name = name
         self.calls = Calls(name)
-        self.environment, self.spec = make_with_spec(self.calls, name, arguments, render_mode)
+        self.environment, self.spec = make_with_spec(self.calls, name, arguments, render_mode, wrappers)
         self.shape = (self.spec.observation_size,)
 
     def reset(self, seed: int | None) -> np.ndarray:

@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 
 from saclab.environments.foreign import Calls, meant_for_saclab, signals_kept
+from saclab.environments.wrappers import wrapped
 from saclab.errors import SettingError, UserError, in_words, traceback_of, unknown_name
 from saclab.variants import task_name
 
@@ -52,20 +53,27 @@ class EnvironmentSpec:
 
 
 def make_environment(
-    environment: str, arguments: Mapping[str, Any] | None = None, render_mode: str | None = None
+    environment: str,
+    arguments: Mapping[str, Any] | None = None,
+    render_mode: str | None = None,
+    wrappers: Sequence[str] = (),
 ) -> gymnasium.Env[np.ndarray, np.ndarray]:
     """The environment, as `make_with_spec` makes it."""
-    return make_with_spec(Calls(environment), environment, arguments, render_mode)[0]
+    return make_with_spec(Calls(environment), environment, arguments, render_mode, wrappers)[0]
 
 
 def make_with_spec(
-    calls: Calls, environment: str, arguments: Mapping[str, Any] | None, render_mode: str | None
+    calls: Calls,
+    environment: str,
+    arguments: Mapping[str, Any] | None,
+    render_mode: str | None,
+    wrappers: Sequence[str] = (),
 ) -> tuple[gymnasium.Env[np.ndarray, np.ndarray], EnvironmentSpec]:
-    """The environment, checked to be one that saclab can train on; `calls` are those into its code.
+    """The environment inside its wrappers, checked to be one that saclab can train on; `calls` are those into its code.
 
     Raises:
-        UserError: for an unknown id, wrong arguments, a missing dependency, an error of its own, or spaces other than
-            flat Boxes with finite action bounds.
+        UserError: for an unknown id or wrapper, wrong arguments, a missing dependency, an error of its own, or spaces
+            other than flat Boxes with finite action bounds.
     """
     arguments = dict(arguments or {})
     if render_mode is not None:
@@ -76,21 +84,12 @@ def make_with_spec(
         made = calls.run("__init__", gymnasium.make, environment, disable_env_checker=True, **arguments)
         try:
             require_version(environment, made)
+            made = calls.run("__init__", wrapped, made, wrappers)
             return made, environment_spec(environment, made)
         except BaseException:
             with suppress(Exception):
                 calls.run("close", made.close)
             raise
-
-
-def require_import_allowed(environment: str, imports: Sequence[str]) -> None:
-    """Refuse an id read from disk that would import a package which the user has not named: importing runs code."""
-    package, colon, _ = environment.rpartition(":")
-    if colon and package not in imports:
-        raise UserError(
-            f"this run's environment is {environment!r}, which imports the package {package}: if you trust it, add "
-            f"--imports {package}"
-        )
 
 
 @contextmanager
@@ -152,13 +151,13 @@ def environment_spec(name: str, environment: gymnasium.Env[Any, Any]) -> Environ
     """Sizes and bounds; raises SettingError for spaces that saclab cannot train on."""
     observation, action = environment.observation_space, environment.action_space
     if isinstance(observation, Dict):
-        advice = f"wrap it in gymnasium.wrappers.FlattenObservation; its keys are {', '.join(observation)}"
+        advice = f"use --wrappers FlattenObservation; its keys are {', '.join(observation)}"
         raise SettingError("environment", name, f"its observations are a Dict, and a flat Box is needed: {advice}")
     if not isinstance(observation, Box) or len(observation.shape) != 1:
         raise SettingError(
             "environment", name,
             f"its observation space is {observation}, and a Box of one dimension is needed: "
-            "wrap it in gymnasium.wrappers.FlattenObservation",
+            "use --wrappers FlattenObservation",
         )  # fmt: skip
     if isinstance(action, Discrete):
         raise SettingError(
@@ -167,7 +166,10 @@ def environment_spec(name: str, environment: gymnasium.Env[Any, Any]) -> Environ
             "action space, such as MountainCarContinuous-v0 or Pendulum-v1",
         )  # fmt: skip
     if not isinstance(action, Box) or len(action.shape) != 1:
-        raise SettingError("environment", name, f"its action space is {action}, and a Box of one dimension is needed")
+        advice = ": use --wrappers FlattenAction" if isinstance(action, Box) else ""
+        raise SettingError(
+            "environment", name, f"its action space is {action}, and a Box of one dimension is needed{advice}"
+        )
     if 0 in observation.shape + action.shape:
         raise SettingError(
             "environment", name, f"there is nothing to see or to do in it: its spaces are {observation} and {action}"
@@ -176,7 +178,8 @@ def environment_spec(name: str, environment: gymnasium.Env[Any, Any]) -> Environ
         raise SettingError(
             "environment", name,
             f"its action bounds are infinite (low {action.low}, high {action.high}), and actions are scaled to the "
-            "bounds: wrap it in gymnasium.wrappers.RescaleAction or register it with finite bounds",
+            "bounds: give it finite ones by a wrapper of your own (--wrappers package.module:Name), or register it "
+            "with finite ones",
         )  # fmt: skip
     spec = EnvironmentSpec(observation.shape[0], action.shape[0], action.low.copy(), action.high.copy())
     require_usable_bounds(name, spec)

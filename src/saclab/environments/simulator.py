@@ -3,7 +3,8 @@
 A state is a dictionary of NumPy arrays and plain values. Only the very classes named here are looked into: a subclass
 of one may keep more than saclab knows of. Such an environment, or any other, may offer the two methods
 `saclab_capture() -> dict[str, np.ndarray]` and `saclab_restore(dict[str, np.ndarray])`; `capture_mujoco` and
-`restore_mujoco` are there to be called by them. Its generator `np_random` is captured in any case.
+`restore_mujoco` are there to be called by them. Its generator `np_random` is captured in any case. A wrapper in which
+nothing changes within an episode may say so: `saclab_stateless = True` in the class itself.
 """
 
 from __future__ import annotations
@@ -16,18 +17,27 @@ from gymnasium.envs.classic_control import Continuous_MountainCarEnv, PendulumEn
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.wrappers import (
     ClipAction,
+    DtypeObservation,
+    FilterObservation,
     FlattenObservation,
     OrderEnforcing,
     PassiveEnvChecker,
     RescaleAction,
+    RescaleObservation,
+    ReshapeObservation,
     TimeLimit,
 )
+
+from saclab.environments.dm_suite import capture_dm_suite, is_dm_suite, restore_dm_suite
 
 Environment: TypeAlias = gymnasium.Env[Any, Any]
 State: TypeAlias = dict[str, Any]
 
 # Nothing in them changes within an episode.
-STATELESS_WRAPPERS = (ClipAction, FlattenObservation, OrderEnforcing, PassiveEnvChecker, RescaleAction)
+STATELESS_WRAPPERS = (
+    ClipAction, DtypeObservation, FilterObservation, FlattenObservation, OrderEnforcing, PassiveEnvChecker,
+    RescaleAction, RescaleObservation, ReshapeObservation,
+)  # fmt: skip
 
 
 def capture_state(environment: Environment) -> State | None:
@@ -37,7 +47,7 @@ def capture_state(environment: Environment) -> State | None:
     while isinstance(inner, gymnasium.Wrapper):
         if type(inner) is TimeLimit:
             elapsed_steps.append(int(inner._elapsed_steps or 0))
-        elif type(inner) not in STATELESS_WRAPPERS:
+        elif not keeps_nothing(inner):
             return None
         inner = inner.env
     physics = capture_physics(inner)
@@ -46,8 +56,13 @@ def capture_state(environment: Environment) -> State | None:
     return {
         "physics": physics,
         "elapsed_steps": elapsed_steps,
-        "generator": inner.np_random.bit_generator.state,
+        "generator": {} if is_dm_suite(inner) else inner.np_random.bit_generator.state,
     }
+
+
+def keeps_nothing(wrapper: gymnasium.Wrapper[Any, Any, Any, Any]) -> bool:
+    """Whether nothing in it changes within an episode: a wrapper may say so itself, by `saclab_stateless = True`."""
+    return type(wrapper) in STATELESS_WRAPPERS or type(wrapper).__dict__.get("saclab_stateless", False) is True
 
 
 def restore_state(environment: Environment, state: State) -> None:
@@ -65,7 +80,8 @@ def restore_state(environment: Environment, state: State) -> None:
     for limit, elapsed_steps in zip(limits, state["elapsed_steps"], strict=True):
         limit._elapsed_steps = elapsed_steps
     restore_physics(inner, state["physics"])
-    inner.np_random.bit_generator.state = state["generator"]
+    if not is_dm_suite(inner):
+        inner.np_random.bit_generator.state = state["generator"]
 
 
 def capture_physics(environment: Environment) -> dict[str, np.ndarray] | None:
@@ -75,6 +91,8 @@ def capture_physics(environment: Environment) -> dict[str, np.ndarray] | None:
         return captured
     if is_gymnasium_mujoco(environment):
         return capture_mujoco(environment)
+    if is_dm_suite(environment):
+        return capture_dm_suite(environment)
     if type(environment) in CLASSIC_CONTROL:
         return {"state": np.array(getattr(environment, "state"))}  # noqa: B009 - mypy does not know the class
     return None
@@ -97,6 +115,8 @@ def restore_physics(environment: Environment, physics: dict[str, np.ndarray]) ->
             raise ValueError(f"{name} is not {array.dtype}{list(array.shape)}")
     if is_gymnasium_mujoco(environment):
         restore_mujoco(environment, physics)
+    elif is_dm_suite(environment):
+        restore_dm_suite(environment, physics)
     else:
         setattr(environment, "state", physics["state"].copy())  # noqa: B010 - classic control keeps it there
 

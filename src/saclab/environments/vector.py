@@ -40,7 +40,12 @@ class TrainingEnvironments:
     """N environments, each always inside an episode: the one after an end starts at once."""
 
     def __init__(
-        self, environment: str, arguments: Mapping[str, Any], seeds: list[int], reward_terms: Sequence[str] = ()
+        self,
+        environment: str,
+        arguments: Mapping[str, Any],
+        seeds: list[int],
+        reward_terms: Sequence[str] = (),
+        wrappers: Sequence[str] = (),
     ) -> None:
         """Make one environment per seed and start its first episode.
 
@@ -49,10 +54,11 @@ class TrainingEnvironments:
             arguments: its keyword arguments.
             seeds: of the first episodes.
             reward_terms: names in the `info` of a step; what they leave of the reward is the last term.
+            wrappers: names, as `wrapped` takes them.
         """
         self.reward_terms = tuple(reward_terms)
         self.name = environment
-        self.environments = [CheckedEnvironment(environment, arguments) for _ in seeds]
+        self.environments = [CheckedEnvironment(environment, arguments, wrappers=wrappers) for _ in seeds]
         self.spec = self.environments[0].spec
         self.observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
         """f32[N, O]: the current observations."""

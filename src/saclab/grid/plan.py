@@ -111,9 +111,10 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
         config = cell.config
         if (cell.folder / "config.json").exists():
             require_same_config(cell.folder, config)
-        key = config.environment, json.dumps(config.environment_arguments, sort_keys=True, default=repr)
+        wrappers = config.training.wrappers
+        key = config.environment, json.dumps([config.environment_arguments, wrappers], sort_keys=True, default=repr)
         if key not in specs:
-            environment = CheckedEnvironment(config.environment, config.environment_arguments)
+            environment = CheckedEnvironment(config.environment, config.environment_arguments, wrappers=wrappers)
             specs[key] = environment.spec
             environment.close()
         layout = layout_of(specs[key], config.algorithm)

@@ -147,7 +147,9 @@ class EnvironmentStateError(CheckpointError):
 @same_directory()
 def spec_of(config: Config) -> EnvironmentSpec:
     """What a learner must know of a run's environment; raises UserError if it cannot be trained on."""
-    environment = CheckedEnvironment(config.environment, config.environment_arguments)
+    environment = CheckedEnvironment(
+        config.environment, config.environment_arguments, wrappers=config.training.wrappers
+    )
     try:
         if names := config.algorithm.reward_terms:
             environment.reset(seed=0)

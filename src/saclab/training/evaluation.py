@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,9 +22,9 @@ class EvaluationEpisodes(NamedTuple):
 class Evaluator:
     """Environments of its own: an evaluation leaves training as it was."""
 
-    def __init__(self, environment: str, arguments: Mapping[str, Any]) -> None:
-        self.name, self.arguments = environment, arguments
-        self.environments = [CheckedEnvironment(environment, arguments)]
+    def __init__(self, environment: str, arguments: Mapping[str, Any], wrappers: Sequence[str] = ()) -> None:
+        self.make = partial(CheckedEnvironment, environment, arguments, wrappers=wrappers)
+        self.name, self.environments = environment, [self.make()]
         self.spec = self.environments[0].spec
 
     @np.errstate(over="ignore")  # what is beyond 32 bits is refused as not finite
@@ -35,7 +36,7 @@ class Evaluator:
             RunBroken: if one breaks its word or raises an error.
         """
         while len(self.environments) < len(seeds):
-            self.environments.append(CheckedEnvironment(self.name, self.arguments))
+            self.environments.append(self.make())
         observation = np.zeros((len(seeds), self.spec.observation_size), np.float32)
         for index, seed in enumerate(seeds):
             observation[index] = self.environments[index].reset(seed)

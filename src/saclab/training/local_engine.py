@@ -66,7 +66,7 @@ class LocalEngine:
         config = start.run.config
         self.environments = restored_environments(start)
         self.spec = self.environments.spec
-        self.evaluator = Evaluator(config.environment, config.environment_arguments)
+        self.evaluator = Evaluator(config.environment, config.environment_arguments, config.training.wrappers)
         self.learner = learner_of(config.algorithm, replay.layout)
         self.policy = self.learner.policy
         self.update = compiled_update(structure(config.algorithm), replay.layout)
@@ -207,8 +207,9 @@ def restored_environments(start: Start) -> TrainingEnvironments:
     config = start.run.config
     first_seeds = seeds.integers(config.seed, "environments", config.training.parallel_environments)
     environments = TrainingEnvironments(
-        config.environment, config.environment_arguments, first_seeds, config.algorithm.reward_terms
-    )
+        config.environment, config.environment_arguments, first_seeds, config.algorithm.reward_terms,
+        config.training.wrappers,
+    )  # fmt: skip
     if start.environments is not None:
         try:
             environments.restore(start.environments, start.run.restart_seeds())

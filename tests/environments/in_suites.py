@@ -1,0 +1,71 @@
+"""Run by test_suites.py in an environment that has dm_control, gymnasium-robotics and MuJoCo 3; not collected here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from resume.helpers import assert_same_run, finish, lines_of, small_config, stop_at
+
+from saclab.environments.make import make_environment
+from saclab.environments.simulator import capture_state, restore_state
+from saclab.playback import evaluate
+
+FLAT = ["FlattenObservation"]
+# Plain ones, one of each kind that changes the model when an episode starts, one with another integrator.
+TASKS = (
+    "cheetah-run", "humanoid-walk", "hopper-hop", "dog-run", "point_mass-hard", "reacher-easy", "finger-turn_hard",
+    "fish-swim", "manipulator-insert_peg", "stacker-stack_2", "cartpole-swingup", "ball_in_cup-catch",
+)  # fmt: skip
+
+
+def go_on(environment, actions) -> list[np.ndarray]:
+    rows = []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = environment.step(action)
+        rows.append(np.concatenate([observation, [reward, terminated, truncated]]))
+    observation, _ = environment.reset()  # the generator of the next episodes goes on as well
+    return [*rows, observation]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_of_the_suite_goes_on_bit_for_bit_in_a_fresh_instance(task):
+    name = f"shimmy:dm_control/{task}-v0"
+    first = make_environment(name, wrappers=FLAT)
+    first.reset(seed=1)
+    first.action_space.seed(2)
+    actions = [first.action_space.sample() for _ in range(30)]
+    go_on(first, actions[:5])
+    for action in actions[:5]:
+        first.step(action)
+    state = capture_state(first)
+    expected = go_on(first, actions[5:])
+    fresh = make_environment(name, wrappers=FLAT)
+    fresh.reset(seed=99)
+    fresh.step(actions[0])
+    restore_state(fresh, state)
+    for step, (ours, theirs) in enumerate(zip(expected, go_on(fresh, actions[5:]), strict=True)):
+        np.testing.assert_array_equal(ours, theirs, err_msg=f"step {step + 1} after the restore")
+
+
+def test_a_task_of_the_composer_is_not_captured():
+    environment = make_environment("shimmy:dm_control/reach_site_features-v0", wrappers=FLAT)
+    environment.reset(seed=0)
+    assert capture_state(environment) is None
+
+
+def test_a_run_on_the_suite_continues_exactly_and_its_policy_is_evaluated(tmp_path):
+    config = small_config("shimmy:dm_control/reacher-easy-v0", environments=3, wrappers=FLAT)
+    finish(config, tmp_path / "straight")
+    stop_at(90, config, tmp_path / "stopped")
+    finish(config, tmp_path / "stopped")
+    assert_same_run(tmp_path / "straight", tmp_path / "stopped")
+    assert evaluate(tmp_path / "straight", 1, 0, imports=["shimmy"]).lengths == [1000]
+
+
+def test_a_run_on_fetch_trains_and_says_that_its_episodes_begin_anew(tmp_path):
+    config = small_config("gymnasium_robotics:FetchReach-v4", wrappers=FLAT)
+    stop_at(90, config, tmp_path)
+    finish(config, tmp_path)
+    (note,) = lines_of(tmp_path / "sessions.jsonl")[1]["notes"]
+    assert "cannot be captured" in note
+    assert evaluate(tmp_path, 1, 0, imports=["gymnasium_robotics"]).lengths == [50]

@@ -121,6 +121,7 @@ def compare(
     batch: int | None = None,
     runs: Path | str = "runs",
     name: str | None = None,
+    sweep: Mapping[str, Sequence[Any]] | None = None,
     report: Path | str | None = None,
     environment_arguments: Mapping[str, Any] | None = None,
     show: Show | None = None,
@@ -134,19 +135,18 @@ def compare(
 ) -> Comparison:
     """Train every variant on every environment with every seed, in worker processes, then write the report.
 
-    Finished runs are skipped, unfinished ones resumed, other processes' waited for; a failed run stops no other.
-
     Args:
         environments: Gymnasium ids.
         variants: keys of `saclab.variants.VARIANTS`.
         seeds: how many (0, 1, …) or which; None for the protocol's own number.
         protocol: a key of `saclab.protocols.PROTOCOLS`.
-        workers: runs at a time; of a run group, the processes that step its environments. None for one per core, or on
-            Ray as many tasks as the cluster has room for.
+        workers: runs at a time, or a run group's processes for environments; None for one per core, or Ray's room.
         threads: cores that XLA uses for each run, or for a run group; None for one, or for all.
         batch: runs of one structure that are trained as one run group; 0: each alone, None: 16 on an accelerator.
-        runs: the folder that holds all runs; on Ray, one that all machines share.
+        runs: the folder that holds all runs: finished ones are skipped, unfinished ones resumed, other processes'
+            waited for, and a failed one stops no other; on Ray, one that all machines share.
         name: takes the variant's place in the paths, for one variant with other settings: an arm of the report.
+        sweep: setting of the algorithm -> values; each combination is an arm of the report.
         report: the report's folder; None for `runs`/report.
         environment_arguments: keyword arguments of every environment.
         show: consumes the stream of statuses and returns the last ones, such as `saclab.cli.display.show_grid`.
@@ -162,7 +162,7 @@ def compare(
         UserError: for a name or value that cannot work, or a missing extra; nothing has been started then.
     """
     resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
-    cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name)
+    cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name, sweep)
     resources.require_startable(cells)
     return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes)
 

@@ -158,13 +158,22 @@ def test_the_report_of_seven_arms_is_small_and_names_them(seven):
     assert {row["differs"] for row in rows if row["name"] == "sac-lag"} == {"polyak_rate 0.0009"}
 
 
-def test_many_arms_are_ranked_and_undecided_pairs_take_one_sentence(seven):
+def test_many_arms_are_ranked_and_each_winner_takes_one_sentence(seven):
     entry = score_environment(read_comparison(seven[0]), "HalfCheetah-v4")
     assert len(entry.pairs) == 21
     *verdicts, undecided, levels = environment_sentences(entry)
     count = sum(not pair.improvement.decided for pair in entry.pairs)
-    assert len(verdicts) == 21 - count > 0
-    assert all(" beats " in verdict for verdict in verdicts)
+    decided = [pair for pair in entry.pairs if pair.improvement.decided]
+    assert len(decided) == 21 - count > len(verdicts) > 0
+    beaten = {
+        verdict.partition(" beats ")[0]: verdict.partition(" beats ")[2].partition(":")[0].split(", ")
+        for verdict in verdicts
+    }
+    assert len(beaten) == len(verdicts)
+    assert sum(map(len, beaten.values())) == len(decided)
+    for pair in decided:  # by the returns, the later an arm stands the better it is
+        worse, better = sorted((pair.x.name, pair.y.name), key=list(SEVEN).index)
+        assert worse in beaten[better]
     assert undecided.startswith(
         f"{count} of the 21 pairs cannot be told apart with these seeds; the nearest to a verdict is "
     )

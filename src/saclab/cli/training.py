@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction
 
 from saclab.config import Config
 from saclab.errors import SettingError
@@ -121,6 +121,9 @@ class Compare:
     name: str | None = None
     """Takes the variant's place in the run folders' paths, for one variant with other settings; the report shows them
     as an arm of this name."""
+    sweep: UseAppendAction[tuple[str, ...]] = ()
+    """Values of a setting of the algorithm, such as polyak_rate=0.001,0.005; once for each setting. Every combination
+    is an arm, whose name tells it."""
     workers: int | None = None
     """Runs at a time; of a run group, the processes that step its environments. None for one per core, or on Ray as
     many tasks as the cluster has room for."""
@@ -146,13 +149,14 @@ class Compare:
         from saclab import api
         from saclab.cli import display
         from saclab.grid.plan import seed_numbers
+        from saclab.grid.sweep import parse_sweep
 
         if not self.environments:
             raise SettingError("environments", (), "name at least one, such as: saclab compare HalfCheetah-v4")
         result = api.compare(
             self.environments, self.variants, seed_numbers(self.seeds, self.protocol, self.first_seed), self.protocol,
             workers=self.workers, threads=self.threads, batch=self.batch, runs=self.where.runs, name=self.name,
-            report=self.report,
+            sweep=parse_sweep(self.sweep), report=self.report,
             tell=lambda text: console.print(text, soft_wrap=True, highlight=False),
             environment_arguments=parse_arguments(self.where.environment_arguments),
             show=lambda stream: display.show_grid(stream, console),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from saclab.config import Config
 from saclab.errors import require
 from saclab.files import absolute, same_directory
+from saclab.grid.sweep import swept_arms
 from saclab.protocols import make_config, protocol_row
 from saclab.training.run_folder import is_finished, run_path
 
@@ -38,8 +40,9 @@ def make_grid(
     environment_arguments: Mapping[str, Any] | None = None,
     overrides: Mapping[str, Any] | None = None,
     name: str | None = None,
+    sweep: Mapping[str, Sequence[Any]] | None = None,
 ) -> list[Cell]:
-    """One cell per environment, seed and variant; all variants of a seed come before the next seed.
+    """One cell per environment, seed, variant and swept arm; all arms of a seed come before the next seed.
 
     So a grid that is stopped early holds whole comparisons of fewer seeds.
 
@@ -52,6 +55,7 @@ def make_grid(
         environment_arguments: keyword arguments of every environment.
         overrides: settings of every run by name.
         name: takes the variant's place in the run folders' paths; for one variant only.
+        sweep: setting of the algorithm -> its values; each combination is an arm, whose name tells them.
 
     Raises:
         UserError: for an unknown name or a value that cannot work.
@@ -61,13 +65,15 @@ def make_grid(
         name is None or len(variants) == 1, "name", name,
         f"it is the name of one variant with other settings, and here are {len(variants)}: choose one with --variants",
     )  # fmt: skip
-    configs = [
-        make_config(environment, variant, protocol, seed, environment_arguments, overrides)
-        for seed in seed_numbers(seeds, protocol)
-        for environment in dict.fromkeys(environments)
-        for variant in variants
-    ]
-    return [Cell(config, run_path(absolute(runs), config, name)) for config in configs]
+    arms, cells = list(swept_arms(sweep or {})), []
+    for seed, environment, variant, arm in product(
+        seed_numbers(seeds, protocol), dict.fromkeys(environments), variants, arms
+    ):
+        changes = dict(overrides or {}) | arm.settings
+        config = make_config(environment, variant, protocol, seed, environment_arguments, changes)
+        own_name = (name or variant) + arm.suffix if arm.suffix else name
+        cells.append(Cell(config, run_path(absolute(runs), config, own_name)))
+    return cells
 
 
 def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 0) -> Sequence[int]:

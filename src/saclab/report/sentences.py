@@ -14,7 +14,8 @@ from saclab.report.text import count_text, interval_text, number_text
 MORE_SEEDS = "More seeds can change that: compare again with --seeds 5; finished runs are kept."
 ONE_SEED = f"One seed of each variant allows no conclusion about which is better. {MORE_SEEDS}"
 MANY_ARMS = 5
-"""Number of arms from which on they are ranked, and pairs that cannot be told apart take one sentence."""
+"""Number of arms from which on they are ranked, an arm that beats others takes one sentence, and so do all pairs that
+cannot be told apart."""
 
 
 def environment_sentences(scores: EnvironmentScores) -> list[str]:
@@ -62,8 +63,12 @@ def pair_sentences(pairs: Sequence[Pair]) -> list[str]:
     decided = [pair for pair in known if pair.improvement.decided]
     undecided = [pair for pair in known if not pair.improvement.decided]
     runs = {pair.x: pair.improvement.runs_x for pair in pairs} | {pair.y: pair.improvement.runs_y for pair in pairs}
-    sentences = [pair_sentence(pair.x.name, pair.y.name, pair.improvement) for pair in decided]
-    if len(runs) >= MANY_ARMS and len(undecided) > 1:
+    many = len(runs) >= MANY_ARMS
+    if many:
+        sentences = winner_sentences(decided)
+    else:
+        sentences = [pair_sentence(pair.x.name, pair.y.name, pair.improvement) for pair in decided]
+    if many and len(undecided) > 1:
         sentences.append(undecided_sentence(undecided, len(known)))
     else:
         sentences += [pair_sentence(pair.x.name, pair.y.name, pair.improvement) for pair in undecided]
@@ -72,6 +77,21 @@ def pair_sentences(pairs: Sequence[Pair]) -> list[str]:
         return [ONE_SEED]
     if alone:
         sentences.append(f"With one seed only, nothing can be said about {', '.join(alone)}. {MORE_SEEDS}")
+    return sentences
+
+
+def winner_sentences(pairs: Sequence[Pair]) -> list[str]:
+    """What is to be said of decided pairs: one sentence for each arm that beats others, most of them first."""
+    beaten: dict[str, dict[str, float]] = {}
+    for pair in pairs:
+        p = pair.improvement.estimate
+        winner, loser = (pair.x.name, pair.y.name) if p > 0.5 else (pair.y.name, pair.x.name)
+        beaten.setdefault(winner, {})[loser] = max(p, 1 - p)
+    sentences = []
+    for winner, losers in sorted(beaten.items(), key=lambda entry: -len(entry[1])):
+        lowest, highest = min(losers.values()), max(losers.values())
+        chance = f"{lowest:.2f}" if f"{lowest:.2f}" == f"{highest:.2f}" else f"{lowest:.2f} to {highest:.2f}"
+        sentences.append(f"{winner} beats {', '.join(losers)}: P = {chance}; the intervals stand in the table.")
     return sentences
 
 

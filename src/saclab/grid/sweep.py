@@ -1,0 +1,80 @@
+"""A sweep: several values of some settings, every combination an arm with a name of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any, NamedTuple, get_type_hints
+
+import msgspec
+
+from saclab.errors import SettingError, require, unknown_name
+from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
+
+EXAMPLE = "polyak_rate=0.001,0.005"
+
+
+class SweptArm(NamedTuple):
+    settings: dict[str, Any]
+    suffix: str
+    """Of its name, behind the variant's."""
+
+
+def swept_arms(sweep: Mapping[str, Sequence[Any]]) -> Iterator[SweptArm]:
+    """Every combination of a sweep's values, the last setting changing first; without a sweep one arm of no change."""
+    for name, values in sweep.items():
+        require_algorithm_setting(name)
+        require(len(values) > 0, "sweep", name, f"give it values, such as {EXAMPLE}")
+    for combination in product(*(dict.fromkeys(map(hashable, values)) for values in sweep.values())):
+        settings = dict(zip(sweep, combination, strict=True))
+        yield SweptArm(settings, "".join(f"-{name}-{value_name(value)}" for name, value in settings.items()))
+
+
+def parse_sweep(texts: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """A sweep from the words of a command line.
+
+    Args:
+        texts: each name=value,value,…; numbers within one value stand apart: hidden_layers=256 256,512 512.
+
+    Raises:
+        UserError: for a name that is no setting of the algorithm, or a value of another type.
+    """
+    hints, sweep = get_type_hints(AlgorithmSettings), {}
+    for text in texts:
+        name, equals, values = text.partition("=")
+        name = name.strip().replace("-", "_")
+        require(bool(equals) and bool(values.strip()), "sweep", text, f"write a setting and its values: {EXAMPLE}")
+        require_algorithm_setting(name)
+        require(name not in sweep, "sweep", text, f"{name} is swept already: give all its values at once")
+        sweep[name] = tuple(parse_value(name, value.strip(), hints[name]) for value in values.split(","))
+    return sweep
+
+
+def parse_value(name: str, text: str, hint: Any) -> Any:
+    """One value of a setting; raises SettingError for text that is none."""
+    plain = None if text.lower() == "none" else text.split() if "tuple" in str(hint) else text
+    try:
+        return msgspec.convert(plain, hint, strict=False)
+    except msgspec.ValidationError as error:
+        raise SettingError("sweep", f"{name}={text}", str(error)) from error
+
+
+def require_algorithm_setting(name: str) -> None:
+    """Raise UserError for what cannot be swept."""
+    known = field_names(AlgorithmSettings)
+    if name in field_names(TrainingSettings):
+        raise SettingError(
+            "sweep", name,
+            "it is a setting of the training, in which the runs of a comparison must agree: sweep settings of the "
+            "algorithm, and compare this one in reports of its own",
+        )  # fmt: skip
+    if name not in known:
+        raise unknown_name("setting", name, known)
+
+
+def hashable(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def value_name(value: Any) -> str:
+    return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -5,21 +5,40 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from saclab.api import Comparison, compare, resume, train
-    from saclab.errors import UserError
+    from saclab.api import Comparison, compare, events, resume, train
+    from saclab.errors import TrainingFailed, UserError
     from saclab.trained_policy import TrainedPolicy, load_policy
+    from saclab.training.events import (
+        EpisodeEnded,
+        Evaluated,
+        Finished,
+        Interrupted,
+        Progress,
+        Saved,
+        Started,
+        UpdatesLogged,
+        Warned,
+    )
+    from saclab.training.requests import Requests
     from saclab.training.run_folder import RunRecord, read_run
 
 __all__ = [
-    "Comparison", "RunRecord", "TrainedPolicy", "UserError", "compare", "load_policy", "read_run", "resume", "train",
+    "Comparison", "EpisodeEnded", "Evaluated", "Finished", "Interrupted", "Progress", "Requests", "RunRecord", "Saved",
+    "Started", "TrainedPolicy", "TrainingFailed", "UpdatesLogged", "UserError", "Warned", "compare", "events",
+    "load_policy", "read_run", "resume", "train",
 ]  # fmt: skip
 
 _HOMES = {
-    "saclab.api": ("Comparison", "compare", "resume", "train"),
-    "saclab.errors": ("UserError",),
+    "saclab.api": ("Comparison", "compare", "events", "resume", "train"),
+    "saclab.errors": ("TrainingFailed", "UserError"),
     "saclab.trained_policy": ("TrainedPolicy", "load_policy"),
+    "saclab.training.events": (
+        "EpisodeEnded", "Evaluated", "Finished", "Interrupted", "Progress", "Saved", "Started", "UpdatesLogged",
+        "Warned",
+    ),
+    "saclab.training.requests": ("Requests",),
     "saclab.training.run_folder": ("RunRecord", "read_run"),
-}
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
@@ -30,3 +49,7 @@ def __getattr__(name: str) -> Any:
         if name in names:
             return getattr(import_module(module), name)
     raise AttributeError(f"module 'saclab' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

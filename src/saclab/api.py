@@ -1,4 +1,4 @@
-"""saclab from Python: `saclab.train`, `saclab.resume`, `saclab.compare`, `saclab.load_policy`, `saclab.read_run`."""
+"""saclab from Python: `saclab.train`, `saclab.events`, `saclab.resume`, `saclab.compare`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from saclab.report.runs import read_runs
 from saclab.signals import requests_from_signals
 from saclab.training.events import Event
 from saclab.training.lock import alone_in
+from saclab.training.requests import Requests
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
 from saclab.variants import COMPARED
 
@@ -63,6 +64,50 @@ def train(
     """
     config = make_config(environment, variant, protocol, seed, environment_arguments, overrides)
     return _train(config, run_path(Path(runs), config, name), on_event, checkpoint_minutes)
+
+
+def events(
+    environment: str,
+    variant: str = "sac-auto",
+    seed: int = 0,
+    protocol: str = "standard",
+    *,
+    runs: Path | str = "runs",
+    name: str | None = None,
+    environment_arguments: Mapping[str, Any] | None = None,
+    requests: Requests | None = None,
+    checkpoint_minutes: float = 10,
+    **overrides: Any,
+) -> Iterator[Event]:
+    """Train one run as `train` does, event by event: what is done between two of them is up to the caller.
+
+    A run goes on only while its events are taken. Who leaves the loop, or is thrown out by Ctrl-C, for which nothing is
+    set up here, finds the run at its last checkpoint: the same call goes on from there. To stop and lose nothing, ask
+    for it: `requests.stop = 1`, and take the events until there are none.
+
+    Args:
+        environment: Gymnasium id.
+        variant: a key of `saclab.variants.VARIANTS`.
+        seed: every random draw derives from it.
+        protocol: a key of `saclab.protocols.PROTOCOLS`.
+        runs: the folder that holds all runs.
+        name: takes the variant's place in the run folder's path, for runs with other settings.
+        environment_arguments: keyword arguments of the environment.
+        requests: through which the run is asked to stop (`stop`) or to save (`save`); looked at after every step.
+        checkpoint_minutes: wall-clock time between checkpoints.
+        **overrides: any setting of AlgorithmSettings or TrainingSettings.
+
+    Yields:
+        Started, then the others of `saclab.training.events`; nothing if the run is finished.
+
+    Raises:
+        UserError: for a name or value that cannot work, or a folder that holds a run with other settings.
+        TrainingFailed: if a number is not finite, the environment breaks, or nothing can be written.
+    """
+    from saclab.training.loop import train as training_events
+
+    config = make_config(environment, variant, protocol, seed, environment_arguments, overrides)
+    yield from training_events(config, run_path(absolute(runs), config, name), requests, checkpoint_minutes)
 
 
 def resume(

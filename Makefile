@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 
 PEERS := .venv-peers
 SUITES := .venv-suites
+WHEEL := .venv-wheel
 
-.PHONY: quickstart test test-slow peers suites fuzz check lint format types benchmark clean
+.PHONY: quickstart test test-slow peers suites wheel fuzz check lint format types benchmark clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
@@ -20,6 +21,14 @@ test-slow: $(VENV)/installed  ## learning to a threshold, long kill-and-resume
 peers: $(PEERS)/installed  ## the other libraries, for `make benchmark` and for a slow test that compares updates with one
 
 suites: $(SUITES)/installed  ## dm_control and gymnasium-robotics, for a slow test that trains on them
+
+wheel: $(VENV)/installed  ## build the wheel, install it into an empty environment, and train with it there
+	rm -rf build dist $(WHEEL)
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+	$(PYTHON) -m venv $(WHEEL)
+	$(WHEEL)/bin/pip install --quiet --disable-pip-version-check --constraint requirements.lock dist/saclab-*.whl
+	cd $(WHEEL) && bin/saclab --version && bin/saclab compare Pendulum-v1 --variants sac sac-auto --protocol quick \
+		--max-updates 50 --random-steps 200 --batch-size 32 --evaluation-interval-steps 250 --runs runs
 
 fuzz: $(VENV)/installed  ## look for damage and misuse that is not told of, for as long as it takes
 	SACLAB_FUZZ=long $(BIN)/python -m pytest -m "slow or not slow" tests/fuzz
@@ -64,4 +73,4 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(PEERS) $(SUITES) build dist src/*.egg-info
+	rm -rf $(VENV) $(PEERS) $(SUITES) $(WHEEL) build dist src/*.egg-info

@@ -44,7 +44,10 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     """Import on first use, so that `import saclab` and `saclab --help` do not wait for JAX."""
     from importlib import import_module
+    from importlib.metadata import version
 
+    if name == "__version__":
+        return version("saclab")
     for module, names in _HOMES.items():
         if name in names:
             return getattr(import_module(module), name)

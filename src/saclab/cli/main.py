@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
@@ -37,6 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command that the words ask for; its exit status."""
+    if list(arguments) == ["--version"]:
+        print(f"saclab {version('saclab')}")
+        return 0
     command = with_absolute_paths(parse(arguments))
     from rich.console import Console
 

@@ -76,6 +76,29 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write a run's best policy as an ONNX file, for programs without saclab; needs the extra `onnx`.
+
+    Inputs: observation [rows, O], and noise [rows, A], 0 if it is left out. Outputs: action, of the mean, and
+    sampled_action; within the environment's bounds, and of its type.
+    """
+
+    run: Positional[Path]
+    """The run folder, or a folder that holds a policy."""
+    out: Path | None = None
+    """File to write; None for policy.onnx beside the policy."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.onnx_export import export_onnx
+        from saclab.trained_policy import policy_folder
+
+        path = self.out or policy_folder(self.run) / "policy.onnx"
+        export_onnx(self.run, path)
+        console.print(str(path), soft_wrap=True, markup=False, highlight=False)
+        return 0
+
+
+@dataclass(frozen=True)
 class Report:
     """Write the comparison of finished and unfinished runs: a page, figures, tables."""
 

@@ -129,11 +129,15 @@ def film_to(
 
     frames_per_second = environment.environment.metadata.get("render_fps", 30)
     partial = partial_of(video)
+    if video.suffix.lower() == ".gif":
+        options = {"duration": 1000 / frames_per_second, "loop": 0}  # milliseconds; players take 20 for the least
+    else:
+        options = {"fps": frames_per_second, "macro_block_size": 2, "quality": 6}
     try:
-        with imageio.get_writer(partial, fps=frames_per_second, macro_block_size=2, quality=6) as writer:
+        with imageio.get_writer(partial, **options) as writer:
             filmed = film(environment, policy, writer, steps, seed)
     except ValueError as error:
-        raise UserError(f"video = {str(video)!r}: {error}; use a name that ends in .mp4") from error
+        raise UserError(f"video = {str(video)!r}: {error}; use a name that ends in .mp4 or .gif") from error
     partial.replace(video)
     return filmed
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from ctypes.util import find_library
 from pathlib import Path
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 
@@ -108,9 +109,13 @@ def test_record_films_the_best_policy_without_a_screen(tmp_path: Path) -> None:
     filmed = saclab("record", str(run), "--video", "hopper.mp4", "--steps", "5", "--size", "64", folder=tmp_path)
     assert filmed.returncode == 0, filmed.stderr
     assert (tmp_path / "hopper.mp4").read_bytes()[4:8] == b"ftyp"
+    filmed = saclab("record", str(run), "--video", "hopper.gif", "--steps", "5", "--size", "64", folder=tmp_path)
+    assert filmed.returncode == 0, filmed.stderr
+    assert len(imageio.mimread(tmp_path / "hopper.gif")) == 5
     refused = saclab("record", str(run), "--video", "hopper.xyz", "--steps", "5", "--size", "64", folder=tmp_path)
     assert refused.returncode == 2
     assert "hopper.xyz" in refused.stderr
+    assert "use a name that ends in .mp4 or .gif" in refused.stderr
 
 
 @pytest.mark.slow

@@ -56,7 +56,7 @@ class Record:
     run: Positional[Path]
     """The run folder."""
     video: Path | None = None
-    """File to write; None for best/video.mp4 in the run folder, where the report finds it."""
+    """File to write, .mp4 or .gif; None for best/video.mp4 in the run folder, where the report finds it."""
     steps: int = 300
     """Environment steps to film at most."""
     seed: int = 1_000_000

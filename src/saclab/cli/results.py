@@ -124,6 +124,30 @@ class Report:
 
 
 @dataclass(frozen=True)
+class Watch:
+    """Show the report's page in the browser while its runs go on; what you have chosen on it stays chosen."""
+
+    runs: Positional[tuple[Path, ...]]
+    """Run folders, or folders that hold some."""
+    port: int = 8642
+    """Of this machine's own address, 127.0.0.1; 0 for any that is free."""
+    every: float = 10.0
+    """Seconds in which the page is made at most once; it is made only while somebody looks and runs change."""
+    allow_mixed: bool = False
+    """Show runs that differ in more than variant, name and seed as well, labelled by what differs, never pooled."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.report.watch import WatchedPage, server_of
+
+        if not self.every >= 0:
+            raise SettingError("every", self.every, "use 0 or more seconds")
+        with server_of(WatchedPage(self.runs or (Path("runs"),), self.every, self.allow_mixed), self.port) as server:
+            console.print(f"http://127.0.0.1:{server.server_port}/  Ctrl-C ends it; the runs go on", soft_wrap=True)
+            server.serve_forever()
+        return 0
+
+
+@dataclass(frozen=True)
 class Variants:
     """List the variants of SAC."""
 

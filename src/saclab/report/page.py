@@ -49,14 +49,17 @@ def make_page(
     together: AggregateScores | None,
     curves: Curves,
     warnings: Sequence[str],
+    version: str = "",
 ) -> str:
-    """The whole page."""
+    """The whole page; one with a version is served, and may ask its server for a newer one."""
     style, script = read_data("report.css"), read_data("report.js")
     sections = [summary(comparison, scores, together)]
     sections += [environment_section(entry, number) for number, entry in enumerate(scores)]
     sections += [together_section(together), videos(comparison, scores), left_out(comparison)]
     sections += [settings(comparison, scores)]
     return Template(read_data("report.html")).substitute(
+        version=version,
+        connect="connect-src 'self'; " if version else "",
         style=style,
         script=script,
         style_hash=content_hash(style),

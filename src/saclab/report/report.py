@@ -4,15 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from saclab.errors import UserError
-from saclab.report.curves import gather_curves
+from saclab.report.curves import Curves, gather_curves
 from saclab.report.figures import write_figures
 from saclab.report.notices import all_notices
 from saclab.report.page import make_page
-from saclab.report.runs import read_comparison
-from saclab.report.scores import aggregate, score_environment
+from saclab.report.runs import Comparison, read_comparison
+from saclab.report.scores import AggregateScores, EnvironmentScores, aggregate, score_environment
 from saclab.report.tables import latex, markdown, scores_csv
+
+
+class Compared(NamedTuple):
+    """What a report tells of."""
+
+    comparison: Comparison
+    scores: list[EnvironmentScores]
+    together: AggregateScores | None
+    curves: Curves
+    warnings: list[str]
+
+
+def compared(runs: Sequence[Path], allow_mixed: bool = False, strict: bool = False) -> Compared:
+    """Compare runs; raises UserError if no folder can be read or they are not comparable."""
+    comparison = read_comparison(runs, allow_mixed, strict)
+    scores = [score_environment(comparison, environment) for environment in comparison.environments]
+    warnings = [*all_notices(comparison), *(f"Mixed on request: {difference}" for difference in comparison.mixed)]
+    return Compared(comparison, scores, aggregate(scores), gather_curves(comparison), warnings)
+
+
+def page_of(found: Compared, version: str = "") -> str:
+    """The page of a comparison; one with a version asks the server it came from for a newer one."""
+    return make_page(*found, version)
 
 
 def write_report(
@@ -41,22 +65,18 @@ def write_report(
         UserError: if no folder can be read, for runs that are not comparable, two runs of one experiment and seed, or
             a place that cannot be written to.
     """
-    comparison = read_comparison(runs, allow_mixed, strict)
-    for reason in comparison.left_out:
+    found = compared(runs, allow_mixed, strict)
+    for reason in found.comparison.left_out:
         tell(f"left out: {reason}")
-    scores = [score_environment(comparison, environment) for environment in comparison.environments]
-    together = aggregate(scores)
-    curves = gather_curves(comparison)
-    warnings = [*all_notices(comparison), *(f"Mixed on request: {difference}" for difference in comparison.mixed)]
     texts = {
-        "report.md": markdown(comparison, scores, warnings),
-        "scores.csv": scores_csv(comparison, scores),
-        "table.tex": latex(scores, warnings),
-        "index.html": make_page(comparison, scores, together, curves, warnings),
+        "report.md": markdown(found.comparison, found.scores, found.warnings),
+        "scores.csv": scores_csv(found.comparison, found.scores),
+        "table.tex": latex(found.scores, found.warnings),
+        "index.html": page_of(found),
     }
     try:
         out.mkdir(parents=True, exist_ok=True)
-        write_figures(comparison, scores, together, curves, out / "figures")
+        write_figures(found.comparison, found.scores, found.together, found.curves, out / "figures")
         for name, text in texts.items():
             (out / name).write_text(text, encoding="utf-8")
     except OSError as error:

@@ -290,4 +290,34 @@
     if (document.body.clientWidth !== width) { width = document.body.clientWidth; drawAll(); }
   });
   drawAll();
+
+  // A page that is served asks for a newer one, and keeps what its reader has chosen.
+  const version = document.documentElement.dataset.version;
+  if (version) {
+    const inputs = () => [...controls.querySelectorAll("input")].map((input) => [`${input.name}: ${input.parentNode.textContent}`, input]);
+    const details = () => [...document.querySelectorAll("details")].map((node) => [node.querySelector("summary").textContent, node]);
+    const kept = JSON.parse(sessionStorage.getItem("saclab") || "null");
+    if (kept) {
+      for (const [name, input] of inputs()) {
+        if (name in kept.checked && input.checked !== kept.checked[name]) {
+          input.checked = kept.checked[name];
+          if (input.type === "checkbox" || input.checked) input.dispatchEvent(new Event("change"));
+        }
+      }
+      for (const [name, node] of details()) node.open = kept.open.includes(name);
+      scrollTo(0, kept.scroll);
+    }
+    const keep = () => sessionStorage.setItem("saclab", JSON.stringify({
+      checked: Object.fromEntries(inputs().map(([name, input]) => [name, input.checked])),
+      open: details().filter(([, node]) => node.open).map(([name]) => name),
+      scroll: scrollY,
+    }));
+    setInterval(async () => {
+      try {
+        if (await (await fetch("version")).text() === version) return;
+      } catch { return; }
+      keep();
+      location.reload();
+    }, 2000);
+  }
 })();

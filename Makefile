@@ -61,9 +61,9 @@ $(PEERS)/installed: benchmarks/peers.txt
 
 $(SUITES)/installed: tests/environments/suites.txt requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(SUITES)
-	grep -v '^mujoco' requirements.lock > $(SUITES)/constraints.txt
+	grep -v -e '^mujoco' -e '^numpy' requirements.lock > $(SUITES)/constraints.txt
 	$(SUITES)/bin/pip install --quiet --disable-pip-version-check --constraint $(SUITES)/constraints.txt \
-		--requirement tests/environments/suites.txt --editable '.[dev]'
+		--constraint tests/environments/suites.txt --editable '.[dev,dm-control,robotics]'
 	touch $@
 
 $(VENV)/installed: requirements.lock pyproject.toml

@@ -1,12 +1,13 @@
 """Seconds until a policy is good: what a user of a CPU waits for.
 
-    python benchmarks/time_to_score.py HalfCheetah-v4 --peers .venv-peers/bin/python [--seeds 3] [--only fast sac-auto]
+    python benchmarks/time_to_score.py HalfCheetah-v4 --peers .venv-peers/bin/python [--only 'sac-auto, fast' sac-auto]
     python benchmarks/time_to_score.py HalfCheetah-v4 --table
 
 Each contestant trains from the start of its process until the mean return of an evaluation of five episodes, one every
-5,000 environment steps, reaches the environment's highest score; start, compilation, evaluations and files are counted
-in. One core each, as many side by side as there are cores, seed by seed and the contestants of a seed in turn. What is
-kept already is not run again, so the measurement can be stopped and go on; `--only` chooses contestants.
+5,000 environment steps, reaches the environment's highest score; start, evaluations, files and compilation (nothing is
+compiled before) are counted in. One core each, as many side by side as there are cores; seed by seed, contestants in
+turn. What is kept already is not run again, so the measurement can be stopped and go on; `--only` chooses
+contestants.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -51,28 +53,31 @@ class Race(NamedTuple):
     peers: Path | None
     kept: Path
 
-    def known(self) -> dict[str, dict[str, Evaluations]]:
-        """Contestant -> seed -> its evaluations."""
+    def known(self) -> dict[str, dict[str, Any]]:
+        """Contestant -> seed -> its evaluations, and when and on what they were made."""
         return json.loads(self.kept.read_text())["contestants"] if self.kept.exists() else {}
 
     def keep(self, contestant: str, seed: int, evaluations: Evaluations) -> None:
         every = self.known()
-        every.setdefault(contestant, {})[str(seed)] = evaluations
-        self.kept.write_text(json.dumps(facts() | {"contestants": every}) + "\n")
+        every.setdefault(contestant, {})[str(seed)] = facts() | {"evaluations": evaluations}
+        self.kept.write_text(json.dumps({"contestants": every}) + "\n")
+
+    def command(self, contestant: str) -> list[str]:
+        if contestant == PEER:
+            return [str(self.peers), str(HERE / "contestants" / "stable_baselines3_score.py")]
+        return [sys.executable, str(HERE / "contestants" / "saclab_score.py")]
 
     def run(self, contestant: str, seed: int, core: int) -> Evaluations:
-        if contestant == PEER:
-            command, settings = [str(self.peers), str(HERE / "contestants" / "stable_baselines3_score.py")], {}
-        else:
-            command, settings = [sys.executable, str(HERE / "contestants" / "saclab_score.py")], SACLAB[contestant]
+        settings = SACLAB.get(contestant, {})
         with tempfile.TemporaryDirectory() as folder:
             job = ScoreJob(
                 self.environment, seed, max(SCORES[self.environment]), MOST_STEPS, 5_000, 5, folder, time.time(),
                 settings,
             )  # fmt: skip
             done = subprocess.run(
-                [*command, job.to_json()], check=False, capture_output=True, text=True,
-                env=os.environ | thread_limits(1), preexec_fn=lambda: os.sched_setaffinity(0, [core]),
+                [*self.command(contestant), job.to_json()], check=False, capture_output=True, text=True,
+                env=os.environ | thread_limits(1) | {"XDG_CACHE_HOME": folder},
+                preexec_fn=lambda: os.sched_setaffinity(0, [core]),
             )  # fmt: skip
         if done.returncode:
             raise RuntimeError(f"{contestant}, seed {seed}, failed:\n{done.stderr[-3000:]}")
@@ -88,6 +93,10 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="only print what is kept")
     options = parser.parse_args()
     race = Race(options.environment, options.peers, HERE / "results" / f"time-to-score-{options.environment}.json")
+    if PEER in options.only and not options.table and options.peers is None:
+        parser.error(
+            f"{PEER} needs --peers, the Python of the environment that `make peers` sets up; or leave it out of --only"
+        )
     if not options.table:
         run_all(race, [(name, seed) for seed in range(options.seeds) for name in options.only])
     print_table(race)
@@ -98,19 +107,23 @@ def run_all(race: Race, wanted: list[tuple[str, int]]) -> None:
     for core in usable_cores():
         cores.put(core)
 
-    def one(job: tuple[str, int]) -> tuple[tuple[str, int], Evaluations]:
+    keeping = threading.Lock()
+
+    def one(name: str, seed: int) -> None:
         core = cores.get()
         try:
-            return job, race.run(*job, core)
+            evaluations = race.run(name, seed, core)
         finally:
             cores.put(core)
+        with keeping:
+            race.keep(name, seed, evaluations)
+        print(f"{name}, seed {seed}: {evaluations[-1]}", flush=True)
 
     known = race.known()
     missing = [(name, seed) for name, seed in wanted if str(seed) not in known.get(name, {})]
     with ThreadPoolExecutor(len(usable_cores())) as pool:
-        for (name, seed), evaluations in pool.map(one, missing):
-            race.keep(name, seed, evaluations)
-            print(f"{name}, seed {seed}: {evaluations[-1]}", flush=True)
+        for done in [pool.submit(one, *job) for job in missing]:
+            done.result()
 
 
 def reached(evaluations: Evaluations, score: float) -> tuple[float, int] | None:
@@ -128,7 +141,7 @@ def print_table(race: Race) -> None:
 
 def cells(seeds: dict[str, Any], score: float) -> Iterator[str]:
     """The median over the seeds that reached it, and each seed's in brackets."""
-    found = [reached(evaluations, score) for _, evaluations in sorted(seeds.items())]
+    found = [reached(kept["evaluations"], score) for _, kept in sorted(seeds.items())]
     for place, unit in ((0, 1), (1, 1000)):
         values = [each[place] / unit for each in found if each]
         each = ", ".join("–" if hit is None else f"{hit[place] / unit:.0f}" for hit in found)

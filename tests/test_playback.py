@@ -14,12 +14,13 @@ from saclab.environments.make import EnvironmentSpec
 from saclab.errors import SettingError, UserError
 from saclab.playback import evaluate, filmed_environment, record
 from saclab.protocols import make_config
+from saclab.records import PolicyDescription
 from saclab.trained_policy import TrainedPolicy, save_policy
 
 
 @pytest.mark.parametrize("name", ["HalfCheetah-v4", "Hopper-v4", "Walker2d-v4", "Ant-v4", "Humanoid-v4", "Humanoid-v5"])
 def test_the_camera_follows_the_robot(name: str) -> None:
-    environment = filmed_environment(name, {}, size=64)
+    environment = filmed_environment(described(name), size=64)
     model, renderer = environment.environment.unwrapped.model, environment.environment.unwrapped.mujoco_renderer
     camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
     assert camera >= 0
@@ -29,9 +30,20 @@ def test_the_camera_follows_the_robot(name: str) -> None:
 
 
 def test_an_environment_that_knows_no_camera_keeps_its_own_view() -> None:
-    environment = filmed_environment("Pendulum-v1", {"g": 9.0}, size=64)
+    environment = filmed_environment(described("Pendulum-v1", g=9.0), size=64)
     assert (environment.environment.unwrapped.g, environment.environment.unwrapped.render_mode) == (9.0, "rgb_array")
     environment.close()
+
+
+def test_a_film_is_of_the_environment_inside_its_wrappers() -> None:
+    environment = filmed_environment(described("Hopper-v4", wrappers=("TimeAwareObservation",)), size=64)
+    assert environment.spec.observation_size == 12
+    assert environment.environment.unwrapped.mujoco_renderer.width == 64
+    environment.close()
+
+
+def described(environment: str, wrappers: tuple[str, ...] = (), **arguments: object) -> PolicyDescription:
+    return PolicyDescription(environment, arguments, 1, 1, {}, wrappers=wrappers)
 
 
 def saved_policy(folder: Path, environment: str, arguments: dict[str, object], spec: EnvironmentSpec) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -78,12 +78,13 @@ def events(
     requests: Requests | None = None,
     checkpoint_minutes: float = 10,
     **overrides: Any,
-) -> Iterator[Event]:
+) -> Generator[Event]:
     """Train one run as `train` does, event by event: what is done between two of them is up to the caller.
 
     A run goes on only while its events are taken. Who leaves the loop, or is thrown out by Ctrl-C, for which nothing is
-    set up here, finds the run at its last checkpoint: the same call goes on from there. To stop and lose nothing, ask
-    for it: `requests.stop = 1`, and take the events until there are none.
+    set up here, finds the run at its last checkpoint: the same call goes on from there, once the iterator is closed
+    (`close()`) or forgotten. To stop and lose nothing, ask for it: `requests.stop = 1`, and take the events until there
+    are none.
 
     Args:
         environment: Gymnasium id.
@@ -97,8 +98,8 @@ def events(
         checkpoint_minutes: wall-clock time between checkpoints.
         **overrides: any setting of AlgorithmSettings or TrainingSettings.
 
-    Yields:
-        Started, then the others of `saclab.training.events`; nothing if the run is finished.
+    Returns:
+        An iterator of Started, then the others of `saclab.training.events`; of nothing if the run is finished.
 
     Raises:
         UserError: for a name or value that cannot work, or a folder that holds a run with other settings.
@@ -107,7 +108,7 @@ def events(
     from saclab.training.loop import train as training_events
 
     config = make_config(environment, variant, protocol, seed, environment_arguments, overrides)
-    yield from training_events(config, run_path(absolute(runs), config, name), requests, checkpoint_minutes)
+    return training_events(config, run_path(absolute(Path(runs)), config, name), requests, checkpoint_minutes)
 
 
 def resume(

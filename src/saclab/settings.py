@@ -211,6 +211,10 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         lists_to_tuples(self)
         require_representable(vars(self), ())
+        require(
+            isinstance(self.wrappers, tuple) and all(isinstance(name, str) and name for name in self.wrappers),
+            "wrappers", self.wrappers, "give a list of names; a class of your own is package.module:Name",
+        )  # fmt: skip
         positive = ("parallel_environments", "update_interval", "updates_per_interval", "replay_capacity",
                     "evaluation_episodes", "log_interval")  # fmt: skip
         for name in positive:

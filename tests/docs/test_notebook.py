@@ -63,3 +63,16 @@ def test_every_public_name_is_there():
     for name in saclab.__all__:
         assert getattr(saclab, name).__name__ == name
     assert dir(saclab) == sorted(saclab.__all__)
+
+
+def test_events_are_checked_at_once_and_free_the_run_when_closed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(saclab.UserError, match="unknown setting 'bogus'"):
+        saclab.events("Pendulum-v1", bogus=1)
+    small = {"protocol": "quick", "random_steps": 40, "batch_size": 8, "hidden_layers": (4,), "max_updates": 5}
+    stream = saclab.events("Pendulum-v1", **small)
+    assert isinstance(next(stream), saclab.Started)
+    with pytest.raises(saclab.UserError, match="in use by this process: close the iterator of its events first"):
+        saclab.train("Pendulum-v1", **small)
+    stream.close()
+    assert saclab.train("Pendulum-v1", **small).result["updates"] == 5

@@ -15,6 +15,7 @@ FLAT = ["FlattenObservation"]
 TASKS = (
     "cheetah-run", "humanoid-walk", "hopper-hop", "dog-run", "point_mass-hard", "reacher-easy", "finger-turn_hard",
     "fish-swim", "manipulator-insert_peg", "stacker-stack_2", "cartpole-swingup", "ball_in_cup-catch",
+    "quadruped-run", "quadruped-escape",
 )  # fmt: skip
 
 
@@ -47,8 +48,9 @@ def test_an_episode_of_the_suite_goes_on_bit_for_bit_in_a_fresh_instance(task):
         np.testing.assert_array_equal(ours, theirs, err_msg=f"step {step + 1} after the restore")
 
 
-def test_a_task_of_the_composer_is_not_captured():
-    environment = make_environment("shimmy:dm_control/reach_site_features-v0", wrappers=FLAT)
+@pytest.mark.parametrize("task", ["reach_site_features", "lqr-lqr_2_1"])
+def test_what_keeps_more_is_not_captured(task):
+    environment = make_environment(f"shimmy:dm_control/{task}-v0", wrappers=FLAT)
     environment.reset(seed=0)
     assert capture_state(environment) is None
 

@@ -10,10 +10,14 @@ import pytest
 
 TESTS = Path(__file__).parents[1]
 PYTHON = TESTS.parent / ".venv-suites" / "bin" / "python"
+INSTALLED = PYTHON.parents[1] / "installed"
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not PYTHON.exists(), reason="dm_control and gymnasium-robotics are not installed: make suites")
+@pytest.mark.skipif(
+    not INSTALLED.exists(),
+    reason="dm_control and gymnasium-robotics are not installed: make suites",
+)
 def test_runs_on_dm_control_and_robotics_train_and_resume():
     script = Path(__file__).with_name("in_suites.py")
     ran = subprocess.run(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -15,11 +16,12 @@ from batch.helpers import train as train_group
 from gymnasium.spaces import Box
 from resume.helpers import assert_same_run, finish, small_config, stop_at
 
+import saclab
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.make import make_environment
 from saclab.environments.simulator import capture_state
 from saclab.errors import UserError
-from saclab.playback import evaluate
+from saclab.playback import evaluate, record
 from saclab.report.train_command import train_command
 from saclab.training.run_folder import read_run
 
@@ -66,6 +68,7 @@ def own(tmp_path, monkeypatch):
     """A module of a user's wrappers, which worker processes find too."""
     (tmp_path / "modules").mkdir()
     (tmp_path / "modules" / "own_wrappers.py").write_text(OWN)
+    (tmp_path / "modules" / "raising.py").write_text("1 / 0")
     monkeypatch.syspath_prepend(tmp_path / "modules")
     yield
     sys.modules.pop("own_wrappers", None)
@@ -119,7 +122,13 @@ def test_the_first_wrapper_is_the_innermost(own):
     [
         (["FlatenObservation"], "unknown wrapper 'FlatenObservation': did you mean 'FlattenObservation'"),
         (["vector"], "unknown wrapper 'vector'"),
-        (["no_such_module:Wrapper"], "wrappers = 'no_such_module:Wrapper': .*No module named 'no_such_module'"),
+        (["no_such_module:Wrapper"], "wrappers = 'no_such_module:Wrapper': there is no module no_such_module"),
+        (["raising:Wrapper"], "wrappers = 'raising:Wrapper': its module cannot be imported: ZeroDivisionError"),
+        ([":Wrapper"], "wrappers = ':Wrapper': write package.module:Name"),
+        ([".own_wrappers:Louder"], "write package.module:Name"),
+        (["own_wrappers:Louder:more"], "write package.module:Name"),
+        (["gymnasium.wrappers:NormalizeObservation"], "use --observation-normalisation running"),
+        (["ClipAction"], "leave it out: actions are clipped"),
         (["own_wrappers:Wrapper"], "wrappers = 'own_wrappers:Wrapper': .* write package.module:Name"),
         (["own_wrappers:broken"], "it cannot be put around the environment .RuntimeError: no such part.*:function"),
         (["own_wrappers:nothing"], "it gave NoneType in place of an environment"),
@@ -164,7 +173,10 @@ def test_a_wrapped_run_and_its_policy_know_the_wrappers(own, tmp_path, monkeypat
     assert loud["mean_return"] < 5 * quiet["mean_return"], "Pendulum's rewards are negative"
     with pytest.raises(UserError, match="imports the package own_wrappers: if you trust it, add --imports"):
         evaluate(tmp_path / "run", 1, 0)
-    assert evaluate(tmp_path / "run", 1, 0, imports=["own_wrappers"]).mean_return < -1000
+    assert evaluate(tmp_path / "run", 1, 0, imports=["own_wrappers"]).mean_return < -5000, "ten times a Pendulum's"
+    for use in (saclab.resume, partial(record, video=tmp_path / "x.mp4", steps=1, seed=0, size=64)):
+        with pytest.raises(UserError, match="--imports own_wrappers"):
+            use(tmp_path / "run")
     told = train_command(config)
     assert "--wrappers own_wrappers:Louder own_wrappers:parts FlattenObservation" in told
 

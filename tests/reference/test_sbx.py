@@ -22,8 +22,12 @@ from saclab.algorithm.learner import Parts
 from .numpy_networks import BatchNormPerceptron, LayerNormPerceptron, Perceptron
 
 PEERS = Path(__file__).parents[2] / ".venv-peers" / "bin" / "python"
+INSTALLED = PEERS.parents[1] / "installed"
 SCRIPT = Path(__file__).with_name("sbx_update.py")
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not PEERS.exists(), reason="SBX is not installed: make peers")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not INSTALLED.exists(), reason="SBX is not installed: make peers"),
+]
 
 # Numbers that 32 bits hold exactly.
 NUMBERS = {

@@ -142,3 +142,14 @@ def test_unfinished_and_untested_runs_are_noticed(tmp_path):
 def test_shown_text_is_one_printable_line():
     assert shown("a\nb\x00\u202e\ud800c") == "a b   c"
     assert len(shown("x" * 500)) == 80
+
+
+def test_a_changed_environment_is_told_apart_from_the_papers(tmp_path):
+    def told(environment: str, overrides: dict) -> bool:
+        run = write_run(tmp_path / str(len(list(tmp_path.iterdir()))), environment=environment, overrides=overrides)
+        return any("another task" in notice for notice in all_notices(read_comparison([run])))
+
+    wrapped = {"wrappers": ["ClipReward"]}
+    assert told("HalfCheetah-v4", wrapped)
+    assert not told("HalfCheetah-v4", {})
+    assert not told("Hopper-v4", wrapped), "the paper has no numbers of it"

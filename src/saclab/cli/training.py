@@ -6,7 +6,7 @@ Nothing slow is imported before a command runs, so that `saclab --help` answers 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -22,6 +22,8 @@ from saclab.variants import COMPARED
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from saclab.training.events import Event
 
 Given = Mapping[str, Any]
 """The settings that were given, by name; `saclab.cli.settings` makes an option of each."""
@@ -122,8 +124,9 @@ class Compare:
     """Takes the variant's place in the run folders' paths, for one variant with other settings; the report shows them
     as an arm of this name."""
     sweep: UseAppendAction[tuple[str, ...]] = ()
-    """Values of a setting of the algorithm, such as polyak_rate=0.001,0.005; once for each setting. Every combination
-    is an arm, whose name tells it."""
+    """Values of a setting of the algorithm, such as polyak_rate=0.001,0.005 or "hidden_layers=256 256,512 512"; once
+    for each setting. Every combination is an arm, whose name tells it; that of the variant's own values is the
+    variant."""
     workers: int | None = None
     """Runs at a time; of a run group, the processes that step its environments. None for one per core, or on Ray as
     many tasks as the cluster has room for."""
@@ -239,7 +242,7 @@ def train_and_show(
     if is_finished(folder):
         console.print(f"{folder} is finished already; its results are kept", soft_wrap=True, markup=False)
     with requests_from_signals(process_ends=True) as requests:
-        stream = train(config, folder, requests, checkpoint_minutes)
+        stream: Iterable[Event] = train(config, folder, requests, checkpoint_minutes)
         if tensorboard:
             stream = trackers.tensorboard(stream)
         if wandb_project is not None:

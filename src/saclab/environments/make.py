@@ -196,8 +196,8 @@ def require_usable_bounds(name: str, spec: EnvironmentSpec) -> None:
     if not usable:
         raise SettingError(
             "environment", name,
-            f"actions cannot be scaled to its action bounds (low {low}, high {high}, of type {low.dtype}): wrap it in "
-            "gymnasium.wrappers.RescaleAction or register it with closer ones",
+            f"actions cannot be scaled to its action bounds (low {low}, high {high}, of type {low.dtype}): give it "
+            "closer ones by a wrapper of your own (--wrappers package.module:Name), or register it with such",
         )  # fmt: skip
 
 

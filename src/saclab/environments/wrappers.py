@@ -33,11 +33,13 @@ class FlattenAction(gymnasium.ActionWrapper[Any, np.ndarray, np.ndarray]):
 
 
 OWN = {"FlattenAction": FlattenAction}
-BETTER = {
-    "NormalizeObservation": "use --observation-normalisation running: evaluations and the policy share its moments",
-    "NormalizeReward": "use --reward-scaling deviation: stored rewards then have today's scale",
+BETTER: dict[Any, str] = {
+    gymnasium.wrappers.NormalizeObservation: "use --observation-normalisation running: evaluations and the policy "
+    "share its moments",
+    gymnasium.wrappers.NormalizeReward: "use --reward-scaling deviation: stored rewards then have today's scale",
+    gymnasium.wrappers.ClipAction: "leave it out: actions are clipped to the environment's bounds anyway",
 }
-"""Wrappers of Gymnasium's whose statistics each environment would have for itself -> what does it right."""
+"""Wrappers of Gymnasium's that are no use here -> what is."""
 
 
 def wrapped(environment: Environment, names: Sequence[str]) -> Environment:
@@ -70,34 +72,43 @@ def wrapped(environment: Environment, names: Sequence[str]) -> Environment:
 
 def found(name: str) -> Callable[[Environment], Environment]:
     """The wrapper of a name; raises UserError if there is none."""
-    module, colon, attribute = name.partition(":")
-    if name in BETTER:
-        raise SettingError("wrappers", name, BETTER[name])
     if name in OWN:
         return OWN[name]
-    if not colon:
-        module, attribute = "gymnasium.wrappers", name
+    module, attribute = ("gymnasium.wrappers", name) if ":" not in name else parted(name)
+    if ":" not in name:
         known = {*gymnasium.wrappers.__all__, *OWN} - {"vector"}
         if name not in known:
             raise unknown_name("wrapper", name, known)
     try:
         wrapper: Callable[[Environment], Environment] = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except ModuleNotFoundError as error:
+        missing = f"there is no module {error.name}: is its folder on PYTHONPATH, or the package installed?"
+        raise SettingError("wrappers", name, missing) from error
+    except AttributeError as error:
         raise SettingError("wrappers", name, f"{in_words(error)}; write package.module:Name") from error
+    except Exception as error:
+        refused = SettingError("wrappers", name, f"its module cannot be imported: {in_words(error)}")
+        refused.traceback = traceback_of(error)
+        raise refused from error
+    if isinstance(wrapper, type) and wrapper in BETTER:
+        raise SettingError("wrappers", name, BETTER[wrapper])
     return wrapper
 
 
-def packages_of(environment: str, wrappers: Sequence[str]) -> list[str]:
-    """What would be imported for an id and wrappers: running code that the user may not have meant to run."""
-    named = [environment, *wrappers]
-    return [package for package, colon, _ in (name.rpartition(":") for name in named) if colon]
+def parted(name: str) -> tuple[str, str]:
+    """Module and attribute of package.module:Name; raises SettingError for another form."""
+    module, _, attribute = name.partition(":")
+    if not all(part.isidentifier() for part in (*module.split("."), *attribute.split("."))):
+        raise SettingError("wrappers", name, "write package.module:Name")
+    return module, attribute
 
 
 def require_import_allowed(environment: str, wrappers: Sequence[str], imports: Sequence[str]) -> None:
     """Refuse names read from disk that would import a package which the user has not named: importing runs code."""
-    for package in packages_of(environment, wrappers):
-        if package not in imports:
+    named = {f"environment is {environment!r}": environment.rpartition(":")[0]}
+    named |= {f"environment has the wrapper {name!r}": parted(name)[0] for name in wrappers if ":" in name}
+    for said, package in named.items():
+        if package and package not in imports:
             raise UserError(
-                f"this run's environment is {' inside '.join(map(repr, [environment, *wrappers]))}, which imports the "
-                f"package {package}: if you trust it, add --imports {package}"
+                f"this run's {said}, which imports the package {package}: if you trust it, add --imports {package}"
             )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from saclab.config import Config
-from saclab.errors import require
+from saclab.errors import SettingError, require
 from saclab.files import absolute, same_directory
 from saclab.grid.sweep import swept_arms
 from saclab.protocols import make_config, protocol_row
@@ -55,7 +55,8 @@ def make_grid(
         environment_arguments: keyword arguments of every environment.
         overrides: settings of every run by name.
         name: takes the variant's place in the run folders' paths; for one variant only.
-        sweep: setting of the algorithm -> its values; each combination is an arm, whose name tells them.
+        sweep: setting of the algorithm -> its values; each combination is an arm, whose name tells them; that of the
+            variant's own values is the variant.
 
     Raises:
         UserError: for an unknown name or a value that cannot work.
@@ -65,13 +66,17 @@ def make_grid(
         name is None or len(variants) == 1, "name", name,
         f"it is the name of one variant with other settings, and here are {len(variants)}: choose one with --variants",
     )  # fmt: skip
+    for setting in sorted({*(sweep or {})} & {*(overrides or {})}):
+        raise SettingError("sweep", setting, "it is given for all runs as well: leave out one of the two")
     arms, cells = list(swept_arms(sweep or {})), []
     for seed, environment, variant, arm in product(
         seed_numbers(seeds, protocol), dict.fromkeys(environments), variants, arms
     ):
-        changes = dict(overrides or {}) | arm.settings
-        config = make_config(environment, variant, protocol, seed, environment_arguments, changes)
-        own_name = (name or variant) + arm.suffix if arm.suffix else name
+        plain = make_config(environment, variant, protocol, seed, environment_arguments, overrides)
+        config = make_config(
+            environment, variant, protocol, seed, environment_arguments, {**(overrides or {}), **arm.settings}
+        )
+        own_name = name if config == plain else (name or variant) + arm.suffix
         cells.append(Cell(config, run_path(absolute(runs), config, own_name)))
     return cells
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import msgspec
 
@@ -21,13 +21,29 @@ class SweptArm(NamedTuple):
 
 
 def swept_arms(sweep: Mapping[str, Sequence[Any]]) -> Iterator[SweptArm]:
-    """Every combination of a sweep's values, the last setting changing first; without a sweep one arm of no change."""
-    for name, values in sweep.items():
-        require_algorithm_setting(name)
-        require(len(values) > 0, "sweep", name, f"give it values, such as {EXAMPLE}")
-    for combination in product(*(dict.fromkeys(map(hashable, values)) for values in sweep.values())):
-        settings = dict(zip(sweep, combination, strict=True))
+    """Every combination of a sweep's values, the last setting changing first; without a sweep one arm of no change.
+
+    Raises:
+        UserError: for a name that is no setting of the algorithm, or a value of another type.
+    """
+    converted = {name: converted_values(name, values) for name, values in sweep.items()}
+    for combination in product(*converted.values()):
+        settings = dict(zip(converted, combination, strict=True))
         yield SweptArm(settings, "".join(f"-{name}-{value_name(value)}" for name, value in settings.items()))
+
+
+def converted_values(name: str, values: Sequence[Any]) -> tuple[Any, ...]:
+    """The different values of a setting, each of its type, so that an arm has one name however it was written."""
+    require_algorithm_setting(name)
+    require(
+        isinstance(values, list | tuple | range) and len(values) > 0,
+        "sweep", f"{name}: {values!r}", f"give a list of values, as in {EXAMPLE}",
+    )  # fmt: skip
+    hint = get_type_hints(AlgorithmSettings)[name]
+    try:
+        return tuple(dict.fromkeys(msgspec.convert(value, hint) for value in values))
+    except msgspec.ValidationError as error:
+        raise SettingError("sweep", f"{name}: {values!r}", str(error)) from error
 
 
 def parse_sweep(texts: Sequence[str]) -> dict[str, tuple[Any, ...]]:
@@ -52,9 +68,10 @@ def parse_sweep(texts: Sequence[str]) -> dict[str, tuple[Any, ...]]:
 
 def parse_value(name: str, text: str, hint: Any) -> Any:
     """One value of a setting; raises SettingError for text that is none."""
-    plain = None if text.lower() == "none" else text.split() if "tuple" in str(hint) else text
+    lists, no_value = "tuple" in str(hint), type(None) in get_args(hint) and text.lower() == "none"
+    require(bool(text), "sweep", name, f"a value is missing: write {EXAMPLE}")
     try:
-        return msgspec.convert(plain, hint, strict=False)
+        return msgspec.convert(None if no_value else text.split() if lists else text, hint, strict=False)
     except msgspec.ValidationError as error:
         raise SettingError("sweep", f"{name}={text}", str(error)) from error
 
@@ -70,10 +87,6 @@ def require_algorithm_setting(name: str) -> None:
         )  # fmt: skip
     if name not in known:
         raise unknown_name("setting", name, known)
-
-
-def hashable(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def value_name(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""What every figure and table of some runs must say: scaled down, unfinished, without an evaluation yet."""
+"""What every figure and table of some runs must say: scaled down, unfinished, of another task than the paper's, …"""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from saclab.report.arms import own_training
+from saclab.report.paper import TABLE_2
 from saclab.report.runs import Comparison
 from saclab.report.text import count_text, shown
 from saclab.settings import TrainingSettings
@@ -49,7 +50,15 @@ def notices(runs: Sequence[RunRecord]) -> tuple[str, ...]:
         sentences.append(f"{unfinished} of {len(runs)} runs unfinished")
     if unevaluated:
         sentences.append(f"{unevaluated} of {len(runs)} runs without an evaluation so far")
+    if any(of_another_task(run) for run in runs):
+        sentences.append("Arguments or wrappers change the environment: the paper's numbers are of another task")
     return tuple(sentences)
+
+
+def of_another_task(run: RunRecord) -> bool:
+    """Whether the paper has numbers of this environment, but the run has changed it."""
+    config = run.config
+    return config.environment in TABLE_2 and bool(config.environment_arguments or config.training.wrappers)
 
 
 def all_notices(comparison: Comparison) -> tuple[str, ...]:

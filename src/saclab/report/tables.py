@@ -96,7 +96,7 @@ def settings_table(comparison: Comparison) -> Table:
     for name in names:
         holders: dict[str, list[str]] = {}
         for run, flat in flats:
-            who = shown(run.config.environment) if name == "environment_arguments" else arms[id(run)]
+            who = shown(run.config.environment) if name in ("environment_arguments", "wrappers") else arms[id(run)]
             holders.setdefault(shown(flat.get(name)), []).append(who)
         rows.append((shown(name), holders_text(holders, name in ("environment", "variant", "seed"))))
     return Table("Settings", ("setting", "value"), tuple(rows))

@@ -31,7 +31,10 @@ def locked(folder: Path) -> Iterator[None]:
     with (folder / "lock").open("a+") as file:
         if not taken(file, fcntl.LOCK_EX, LOOKS):
             file.seek(0)
-            raise InUse(f"{folder} is in use by process {file.read(20).strip() or '?'}: wait for it, or stop it first")
+            process = file.read(20).strip() or "?"
+            if process == str(os.getpid()):
+                raise InUse(f"{folder} is in use by this process: close the iterator of its events first")
+            raise InUse(f"{folder} is in use by process {process}: wait for it, or stop it first")
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()

@@ -31,7 +31,7 @@ Told = Iterator[tuple[int, Event]]
 
 def train(
     config: Config, folder: Path, requests: Requests | None = None, checkpoint_minutes: float = 10
-) -> Iterator[Event]:
+) -> Generator[Event]:
     """Train, from the start or from the folder's newest checkpoint, until the protocol's end or a request to stop.
 
     Args:

@@ -287,5 +287,5 @@ def test_a_folder_in_use_is_refused(tmp_path):
     configs = mixed()
     with closing(train_batch(configs, folders(tmp_path, configs), workers=1)) as first:
         next(first)
-        with pytest.raises(UserError, match="in use by process"):
+        with pytest.raises(UserError, match="in use by this process"):
             train(tmp_path, configs)

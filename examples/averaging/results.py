@@ -1,6 +1,7 @@
 """The planned comparisons of docs/averaging.md, from run folders.
 
     python examples/averaging/results.py [RUNS]      examples/averaging/runs, if no folder is named
+    python examples/averaging/results.py --write     puts what is printed between the marks in docs/averaging.md
 
 For each pair and measure: the difference of means with its 95 % Welch interval, and the probability that a run of the
 first scores above a run of the second, with its 95 % interval. An effect is claimed if both leave out no effect.
@@ -10,6 +11,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -34,13 +37,26 @@ PAIRS = {
 FIRST_PHASE = 100  # training episodes
 
 
+HERE = Path(__file__).parent
+PAGE, BEGIN, END = HERE.parents[1] / "docs" / "averaging.md", "<!-- results -->\n", "<!-- end of results -->\n"
+
+
 def main() -> None:
-    comparison = read_comparison(
-        find_runs([Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "runs"])
-    )
+    if sys.argv[1:] != ["--write"]:
+        print_results(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE / "runs")
+        return
+    told = StringIO()
+    with redirect_stdout(told):
+        print_results(HERE / "runs")
+    before, after = PAGE.read_text().split(BEGIN)[0], PAGE.read_text().split(END)[1]
+    PAGE.write_text(f"{before}{BEGIN}{told.getvalue()}\n{END}{after}")
+
+
+def print_results(runs: Path) -> None:
+    comparison = read_comparison(find_runs([runs]))
     for environment in comparison.environments:
         arms = {arm.name: arm for arm in comparison.arms_of(environment)}
-        print(f"\n## {environment}\n")
+        print(f"\n### {environment}\n")
         print_arms(comparison, environment, arms)
         print_pairs(comparison, environment, arms)
 

@@ -28,5 +28,5 @@ def test_the_planned_comparisons_are_printed():
     told = subprocess.run(
         [sys.executable, EXAMPLE / "results.py"], capture_output=True, text=True, check=True
     ).stdout  # fmt: skip
-    assert "## HalfCheetah-v4" in told
+    assert "### HalfCheetah-v4" in told
     assert "| `averaged` |" in told

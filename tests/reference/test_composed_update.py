@@ -17,6 +17,7 @@ from conftest import ACTION_SIZE, MORE_CASES, OBSERVATION_SIZE, VARIANT_CASES, a
 
 from saclab.algorithm.types import Context
 
+from .conftest import cast
 from .numpy_networks import (
     BatchNormPerceptron,
     BatchNormResidual,
@@ -146,10 +147,6 @@ class Comparison(NamedTuple):
     relative: float
     absolute: float
 
-    def cast(self, tree):
-        """With real numbers of so many bits."""
-        return jax.tree.map(lambda x: self.number(x) if np.asarray(x).dtype == np.float32 else x, tree)
-
     def close(self, actual, expected, what: str) -> None:
         np.testing.assert_allclose(actual, expected, rtol=self.relative, atol=self.absolute, err_msg=what)
 
@@ -167,11 +164,11 @@ IN_32_BITS, IN_64_BITS = Comparison(np.float32, 1e-4, 3e-6), Comparison(np.float
 
 def assert_same_update(case, comparison: Comparison) -> None:
     settings, both = case.settings, OBSERVATION_SIZE + ACTION_SIZE
-    case = case._replace(numbers=comparison.cast(case.numbers))
+    case = case._replace(numbers=cast(case.numbers, comparison.number))
     state, generator = case.initial_state(seed=3), np.random.default_rng(5)
     reference = reference_of(case, state)
     for step in range(UPDATES):
-        batch, given = comparison.cast(case.batch(generator)), context_of(case, step, generator)
+        batch, given = cast(case.batch(generator), comparison.number), context_of(case, step, generator)
         drawn = draws(state, step, settings)
         state = case.compiled(case.numbers, state, batch, given)
         expected = reference.update(*columns_of(batch, given), drawn)
@@ -202,13 +199,6 @@ WITHOUT_BATCH_NORM = {name: settings for name, settings in ALL_CASES.items() if 
 @pytest.mark.parametrize("name", as_parameters(WITHOUT_BATCH_NORM))
 def test_the_composed_update_equals_the_reference(name):
     assert_same_update(make_case(ALL_CASES[name]), IN_32_BITS)
-
-
-@pytest.fixture
-def sixty_four_bits():
-    jax.config.update("jax_enable_x64", True)
-    yield
-    jax.config.update("jax_enable_x64", False)
 
 
 @pytest.mark.usefixtures("sixty_four_bits")

@@ -19,6 +19,7 @@ from conftest import ACTION_SIZE, OBSERVATION_SIZE, VARIANT_CASES, context, make
 
 from saclab.algorithm.learner import Parts
 
+from .conftest import cast
 from .numpy_networks import BatchNormPerceptron, LayerNormPerceptron, Perceptron
 
 PEERS = Path(__file__).parents[2] / ".venv-peers" / "bin" / "python"
@@ -54,13 +55,6 @@ CASES = {
 }
 
 
-@pytest.fixture
-def sixty_four_bits():
-    jax.config.update("jax_enable_x64", True)
-    yield
-    jax.config.update("jax_enable_x64", False)
-
-
 @pytest.mark.usefixtures("sixty_four_bits")
 @pytest.mark.parametrize("name", CASES)
 def test_one_update_equals_that_of_sbx(name, tmp_path, monkeypatch):
@@ -68,7 +62,7 @@ def test_one_update_equals_that_of_sbx(name, tmp_path, monkeypatch):
     settings = dataclasses.replace(VARIANT_CASES[row], **NUMBERS | changes)
     case = make_case(settings)
     state, generator = case.initial_state(seed=1), np.random.default_rng(2)
-    state = jax.tree.map(lambda x: np.float64(x) if np.asarray(x).dtype == np.float32 else x, state)
+    state = cast(state, np.float64)
     state = state._replace(
         actor=state.actor._replace(weights=moved(settings.network, state.actor.weights, name, generator)),
         critic=state.critic._replace(weights=moved(settings.network_of_critic, state.critic.weights, name, generator)),
@@ -83,7 +77,7 @@ def test_one_update_equals_that_of_sbx(name, tmp_path, monkeypatch):
 
     draws = list(noise)
     monkeypatch.setattr(Parts, "noise", lambda self, observation, key: draws.pop(0))
-    numbers = jax.tree.map(lambda x: np.float64(x) if np.asarray(x).dtype == np.float32 else x, case.numbers)
+    numbers = cast(case.numbers, np.float64)
     after = case.learner.update(numbers, state, batch, context(0))
     ours = in_sbx(algorithm, settings, after) | {"log_alpha": after.temperature.weights}
     ours |= gradients_in_sbx(algorithm, settings, after)

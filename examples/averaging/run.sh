@@ -58,6 +58,6 @@ commands() {  # environment, number of seeds, limits of the run; the arms come o
 mkdir -p "$runs"
 {
   half_cheetah | commands HalfCheetah-v4 "$stage_1_seeds" --max-episodes 500
-  humanoid | commands Humanoid-v4 "$stage_2_seeds" --max-updates 100000
+  humanoid | commands Humanoid-v4 "$stage_2_seeds" --max-updates 100000 --patience-episodes None
 } | xargs -P 2 -L 1 --process-slot-var=CORE \
   bash -c 'exec taskset --cpu-list "$CORE" nice -n 19 "${SACLAB:-saclab}" "$@" >>"$0/log.txt" 2>&1' "$runs"

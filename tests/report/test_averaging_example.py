@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from saclab.report.report import write_report
 from saclab.training.run_folder import find_runs, is_finished
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "averaging"
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "averaging"
 
 
 def test_the_runs_are_small_and_all_finished():
@@ -24,9 +28,30 @@ def test_the_page_comes_again_from_them(tmp_path):
     assert "averaged-spacing-200" in page.read_text()
 
 
-def test_the_planned_comparisons_are_printed():
-    told = subprocess.run(
-        [sys.executable, EXAMPLE / "results.py"], capture_output=True, text=True, check=True
-    ).stdout  # fmt: skip
-    assert "### HalfCheetah-v4" in told
-    assert "| `averaged` |" in told
+@pytest.fixture(scope="module")
+def printed() -> str:
+    """The planned comparisons, as the command prints them."""
+    command = [sys.executable, EXAMPLE / "results.py"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def test_the_tables_of_the_page_are_those_that_the_command_prints(printed):
+    assert "| `averaged` | 5 |" in printed
+    page = (ROOT / "docs" / "averaging.md").read_text()
+    assert page.partition("<!-- results -->\n")[2].partition("\n<!-- end of results -->")[0] == printed
+
+
+@pytest.mark.parametrize("name", ["docs/averaging.md", "README.md"])
+def test_every_interval_in_the_words_stands_in_the_tables(printed, name):
+    words = (ROOT / name).read_text()
+    if name == "README.md":
+        words = words.partition("**Does averaging help?**")[2].partition("## Two commands")[0]
+    said = re.findall(r"([+−-]?[\d.]+)\s\[([^]]*\d, [^]]*)\]", words)
+    assert len(said) >= (2 if name == "README.md" else 12)
+    known = {tuple(map(plain, found)) for found in re.findall(r"([+-]?[\d.]+) \[([^]]*)\]", printed)}
+    assert not {tuple(map(plain, each)) for each in said} - known
+
+
+def plain(text: str) -> str:
+    """Without signs of plus, which words leave out, and with minus as a program writes it."""
+    return text.replace("−", "-").replace("+", "")

@@ -23,6 +23,7 @@ def served(tmp_path):
         thread.join()
 
 
+@pytest.mark.slow
 def test_a_newer_page_comes_by_itself_and_keeps_the_choices(browser, served, tmp_path):  # noqa: F811
     for variant in ("sac", "averaged"):
         write_run(tmp_path, variant, 0)

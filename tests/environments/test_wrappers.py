@@ -190,6 +190,7 @@ def test_a_run_whose_wrappers_keep_nothing_continues_exactly(own, tmp_path):
     assert_same_run(tmp_path / "straight", tmp_path / "stopped")
 
 
+@pytest.mark.slow
 def test_a_run_group_has_the_wrappers_too(own, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "modules"), prepend=os.pathsep)
     configs = [group_config(seed=seed, wrappers=WRAPPERS) for seed in (0, 1)]

@@ -155,7 +155,7 @@ class Comparison(NamedTuple):
         self.close(own_part(settings, trained.weights, inputs), vector, what)
         self.close(own_part(settings, trained.moments.mu, inputs), adam.first, f"{what}: first moment")
         second = own_part(settings, trained.moments.nu, inputs)  # of squares, which are small
-        small = self.absolute**2 if self.number is np.float64 else self.absolute
+        small = 1e-12 if self.number is np.float64 else self.absolute
         np.testing.assert_allclose(second, adam.second, self.relative, small, err_msg=f"{what}: second moment")
 
 

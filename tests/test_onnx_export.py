@@ -14,7 +14,8 @@ import pytest
 from saclab.algorithm.networks.network import ACTIVATIONS
 from saclab.cli.main import main
 from saclab.environments.make import EnvironmentSpec
-from saclab.onnx_export import export_onnx
+from saclab.errors import UserError
+from saclab.onnx_export import Graph, export_onnx
 from saclab.protocols import make_config
 from saclab.trained_policy import TrainedPolicy, load_policy, save_policy
 from saclab.variants import VARIANTS
@@ -99,3 +100,9 @@ def test_the_command_writes_the_file_and_the_model_says_what_it_is(tmp_path, cap
     assert (tmp_path / "best" / "policy.onnx").exists()
     assert main(["export", str(tmp_path / "nothing")]) == 2
     assert "there is no folder" in capsys.readouterr().err
+
+
+def test_an_operation_that_is_not_known_is_named():
+    value = Graph(onnx).input("observation", 3)
+    with pytest.raises(UserError, match=r"its network calls numpy.sin, whose ONNX operation is not in saclab"):
+        np.sin(value)

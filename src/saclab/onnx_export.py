@@ -76,7 +76,10 @@ class Traced(NDArrayOperatorsMixin):
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *operands: Any, **options: Any) -> Traced:
         if method != "__call__" or options or ufunc.__name__ not in OPERATIONS:
-            raise NotImplementedError(f"no graph is known for numpy.{ufunc.__name__}: name it in OPERATIONS")
+            raise UserError(
+                f"this policy cannot be exported: its network calls numpy.{ufunc.__name__}, whose ONNX operation is "
+                "not in saclab.onnx_export.OPERATIONS"
+            )
         if ufunc is np.matmul:
             width = operands[1].shape[-1]
         else:
@@ -157,7 +160,8 @@ def export_onnx(run: Path | str, path: Path | str) -> None:
         path: of the file.
 
     Raises:
-        UserError: if there is no policy, the extra `onnx` is not installed, or the file cannot be written.
+        UserError: if there is no policy, the extra `onnx` is not installed, the network calls what ONNX is not known to
+            have, or the file cannot be written.
     """
     required("onnx", "onnx", "export")
     policy, description = load_policy(Path(run)), read_description(Path(run))

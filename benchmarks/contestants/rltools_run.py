@@ -1,6 +1,7 @@
 """RLtools, compiled for the job with MKL: its own loop, and evaluations by its compiled policy.
 
-It writes no logs and no policy's file here, which is in its favour. RL_TOOLS_DISABLE_MKL=1 has it use the system's BLAS.
+It writes no logs and no policy's file here, which is in its favour. RL_TOOLS_DISABLE_MKL=1 has it use
+the BLAS of the system.
 """
 
 from __future__ import annotations

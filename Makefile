@@ -54,6 +54,7 @@ types: $(VENV)/installed
 benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other libraries: leave the machine alone for half an hour
 	$(BIN)/python benchmarks/speed.py --peers $(PEERS)/bin/python
 	$(BIN)/python benchmarks/tables.py speed
+	$(BIN)/python benchmarks/tables.py peers
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/memory.py

@@ -34,4 +34,4 @@ def test_the_terms_are_stored_as_they_came_whatever_their_weights():
         )
         assert terms.shape == (40, 3)
         np.testing.assert_allclose(terms.sum(axis=1), rewards[:, 0], rtol=1e-4, atol=1e-5)
-        assert ours.reward_weights.tolist() == [0.0, 3.0, 1.0]
+        assert ours.context.reward_weights.tolist() == [0.0, 3.0, 1.0]

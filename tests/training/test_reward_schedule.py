@@ -59,7 +59,7 @@ def test_an_update_has_the_weights_of_the_updates_before_its_round(round_of, exp
     assert weights_of_updates(config, pausing) == expected
 
 
-def test_the_best_evaluation_so_far_moves_the_weights_and_a_worse_one_does_not():
+def test_the_best_evaluation_so_far_moves_weights_and_a_worse_one_not():
     changes = {"reward_schedule": ("reward_ctrl: 0@return=100 1@return=200",), **SMALL}
     with closing(LocalEngine.new(make_config(CHEETAH, "sac", overrides=changes))) as engine:
         found = [engine.run.reward_weights()[0]]

@@ -116,7 +116,7 @@ class RunWriter:
             *episodes.total_rewards.tolist(), *episodes.lengths.tolist(), self._seconds(),
         )  # fmt: skip
         if self.run.config.algorithm.terms_of_reward:
-            *weights, _ = self.run.reward_weights().tolist()
+            *weights, _ = self.run.reward_weights()
             self.logs.reward_terms(
                 counters.evaluations, counters.steps, counters.updates, counters.episodes,
                 *episodes.term_returns.mean(axis=0).tolist(), *weights, self._seconds(),

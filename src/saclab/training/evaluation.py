@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from saclab.environments.checked import CheckedEnvironment
-from saclab.environments.reward_terms import split_reward
+from saclab.environments.reward_terms import split_within_run
 from saclab.errors import NonFiniteError, RunBroken
 
 
@@ -60,7 +60,7 @@ class Evaluator:
                 seen, reward, terminated, truncated, info = self.environments[index].step(action)
                 observation[index] = seen
                 total_rewards[index] += reward
-                term_returns[index] += split_reward(self.name, reward, info, self.reward_terms)
+                term_returns[index] += split_within_run(self.name, reward, info, self.reward_terms)
                 lengths[index] += 1
                 if not (terminated or truncated):
                     going_on.append(index)

@@ -21,7 +21,7 @@ from saclab.algorithm.policy import Policy
 from saclab.algorithm.targets import reduced_q
 from saclab.config import Config
 from saclab.environments.checked import CheckedEnvironment
-from saclab.environments.reward_terms import split_reward
+from saclab.environments.reward_terms import split_within_run
 from saclab.errors import NonFiniteError
 from saclab.training import seeds
 from saclab.training.requests import Stopped
@@ -157,7 +157,7 @@ def play(
         noise = generator.standard_normal((1, spec.action_size), np.float32)
         action, log_prob = act(critics.actor, seen, noise)
         observation, reward, terminated, truncated, info = environment.step(spec.scale_action(action)[0])
-        terms = split_reward(environment.name, reward, info, critics.reward_terms)
+        terms = split_within_run(environment.name, reward, info, critics.reward_terms)
         weighed = sum(weight * term for weight, term in zip(critics.reward_weights, terms, strict=True))
         rows.append((seen[0], action[0], weighed, float(log_prob[0])))
         if terminated or truncated:

@@ -11,8 +11,8 @@ import saclab
 
 HOUSE = Path(saclab.__file__).parent
 ROOMS = (
-    "errors", "extras", "files", "limits", "refusals", "settings", "config", "variants", "protocols", "machine",
-    "records", "algorithm", "environments", "replay", "memory", "trained_policy", "onnx_export", "training",
+    "errors", "extras", "files", "limits", "reward_schedule", "refusals", "settings", "config", "variants", "protocols",
+    "machine", "records", "algorithm", "environments", "replay", "memory", "trained_policy", "onnx_export", "training",
     "signals", "exits", "batch", "grid", "report", "playback", "play", "tuning", "api", "cli",
 )  # fmt: skip
 """From the ground up: a room imports itself and what stands before it."""

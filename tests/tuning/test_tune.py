@@ -11,11 +11,20 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import saclab
+from saclab.grid.launch import Grid
+from saclab.grid.pool import End
+from saclab.grid.resources import chosen_resources
+from saclab.grid.tasks import RunStatus, make_statuses, make_tasks
+from saclab.tuning.objective import Objective
+from saclab.tuning.open_trial import OpenTrial
+from saclab.tuning.page import folded
 from saclab.tuning.plan import make_plan
 from saclab.tuning.study import (
+    TRIALS_BEFORE_PRUNING,
     best_trial,
     drawn_settings,
     is_complete,
@@ -36,7 +45,7 @@ def plan_of(objective="mean", score=None, pruning=True, seeds=1):
 
 
 def tune(folder: Path, trials: int, **how) -> saclab.Tuned:
-    return saclab.tune("Pendulum-v1", "sac-auto", "quick", trials, space=SPACE, out=folder, **{**SETTINGS, **how})
+    return saclab.tune("Pendulum-v1", "sac-auto", "quick", trials, out=folder, **{"space": SPACE, **SETTINGS, **how})
 
 
 @pytest.fixture(scope="module")
@@ -76,9 +85,9 @@ def test_the_page_shows_the_search_and_needs_nothing_else(tuned):
     assert page.count("data:image/png;base64,") >= 3
     assert "http://" not in page
     assert "https://" not in page
-    for command in result.commands:
-        assert command.split()[1] in ("compare", "report")
-    assert f"--critic-learning-rate {result.best['critic_learning_rate']}" in result.commands[1]
+    assert [words[1] for words in result.commands] == ["compare", "compare", "report"]
+    assert str(result.best["critic_learning_rate"]) in result.commands[1]
+    assert str(folder / "judged") in result.commands[0]
 
 
 def test_the_same_call_trains_nothing_anew_and_more_trials_go_on(tuned):
@@ -92,7 +101,7 @@ def test_a_folder_with_another_tune_is_refused(tuned):
     folder, _ = tuned
     with pytest.raises(saclab.UserError, match="holds a tune with another objective"):
         tune(folder, 3, seeds=2, pruning=False, objective="final")
-    with pytest.raises(saclab.UserError, match="holds a tune with another overrides"):
+    with pytest.raises(saclab.UserError, match="holds a tune with another overrides, max_updates: 60 there, 70 here"):
         tune(folder, 3, seeds=2, pruning=False, max_updates=70)
 
 
@@ -110,14 +119,149 @@ def test_without_optuna_the_command_says_how_to_install_it(tmp_path, monkeypatch
         tune(tmp_path / "tune", 1)
 
 
-def test_a_run_at_its_score_ends_and_a_trial_that_is_slower_is_given_up(tmp_path):
+def test_a_run_at_its_score_is_worth_the_way_there(tmp_path):
     """Every evaluation of Pendulum-v1 is above −2000: each run is at its score at once."""
-    result = tune(tmp_path, 3, objective="steps", score=-2000.0)
+    result = tune(tmp_path, 2, objective="steps", score=-2000.0)
     assert result.value == 40, "the first evaluation, of the policy as it starts"
-    folders = sorted(tmp_path.glob("runs/Pendulum-v1/*/quick/seed-0"))
-    assert len(folders) == 3
-    never = tune(tmp_path / "never", 2, objective="steps", score=0.0)
+    never = tune(tmp_path / "never", 1, objective="steps", score=0.0)
     assert never.own_value == 2 * 160, "PAR2 of a run of 160 steps"
+
+
+def test_a_tune_without_the_variants_own_settings_goes_on_too(tmp_path):
+    space = {"defaults": False, "batch_size": [16, 32]}
+    first = tune(tmp_path, 1, space=space)
+    assert first.own_value is None
+    assert tune(tmp_path, 2, space=space).trials == 2
+
+
+def test_a_folded_command_is_the_same_to_a_shell():
+    words = ["saclab", "compare", "--environment-arguments", json.dumps({"a": 1.5, "b": "x y " * 30}), "--seeds", "5"]
+    printed = subprocess.run(["bash", "-c", f"printf '%s\\n' {folded(words)}"], capture_output=True, text=True)
+    assert printed.stdout.splitlines() == words
+
+
+def trial_with(study, columns, at_rest):
+    """An open trial of runs with these evaluation returns, seen all at once."""
+    runs = [RunStatus(None, "finished" if at_rest else "running") for _ in columns]
+    opened = OpenTrial(study.ask(), runs)
+    opened.evaluations = [{"mean_return": np.array(column), "steps": 10 * (1 + np.arange(len(column)))}
+                          for column in columns]  # fmt: skip
+    return opened
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_a_trial_below_the_median_is_given_up_however_much_was_seen(tmp_path, at_rest):
+    study = open_study(tmp_path, plan_of())
+    for level in range(TRIALS_BEFORE_PRUNING):
+        trial = study.ask()
+        for step in range(1, 7):
+            trial.report(float(level), step)
+        study.tell(trial, float(level))
+    rises = [-10.0, -10.0, -10.0, 100.0, 100.0, 100.0]
+    slow = trial_with(study, [rises], at_rest)
+    assert slow.hopeless(Objective("mean"), study) == "it was below the median of the trials before it"
+    assert len(study.trials[slow.trial.number].intermediate_values) == 2, "the first evaluation is too early"
+    assert slow.hopeless(Objective("mean"), study), "after a kill between the report and its verdict too"
+    assert not trial_with(study, [[5.0] * 6], at_rest).hopeless(Objective("mean"), study)
+    assert not trial_with(study, [rises, []], at_rest).hopeless(Objective("mean"), study), "not all runs have got there"
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_a_trial_slower_than_the_best_is_given_up_at_rest_too(tmp_path, at_rest):
+    study, objective = open_study(tmp_path, plan_of("steps", 0.0)), Objective("steps", 0.0)
+    study.tell(study.ask(), 30.0)
+    assert not trial_with(study, [[-1.0, -1.0, 1.0]], at_rest).hopeless(objective, study), "at its score after 30 steps"
+    assert not trial_with(study, [[-1.0, -1.0, -1.0, 1.0]], at_rest).hopeless(objective, study)
+    slower = trial_with(study, [[-1.0] * 4 + [1.0]], at_rest)
+    assert slower.hopeless(objective, study) == "it needs more than the best so far, 30"
+    assert trial_with(study, [[-1.0] * 4], at_rest).hopeless(objective, study)
+
+
+class Told:
+    """A pool whose workers never begin."""
+
+    places, note, replaces_lost = 2, "no machine is large enough", False
+
+    def __init__(self):
+        self.stopped = []
+
+    def start(self, task):
+        return True
+
+    def stop(self, task):
+        self.stopped.append(task)
+        return True
+
+    def poll(self):
+        return []
+
+
+def test_runs_that_are_given_up_go_no_further_and_others_do(tmp_path):
+    cells = plan_of(seeds=3).cells(tmp_path, "arm", {})
+    statuses, pool = make_statuses(cells), Told()
+    grid = Grid(pool, make_tasks(statuses, 0), 0)
+    grid.start()  # two of the three have a place
+    first, second = grid.running
+    grid.give_up([statuses[0], statuses[2]])
+    assert pool.stopped == [first]
+    assert statuses[2].status == "interrupted", "it waited"
+    assert grid.waiting == []
+    grid.give_up([statuses[0]])
+    assert pool.stopped == [first], "it was told already"
+    grid._ended(first, End(-signal.SIGTERM, ""))
+    assert statuses[0].status == "interrupted"
+    assert statuses[1].status == "running"
+    assert second in grid.running
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+def test_a_worker_stopped_from_outside_ends_the_tune_and_loses_no_trial(tmp_path, number):
+    """The trial is not judged by it: the same call goes on with it, and the first trial keeps its value."""
+    killed = []
+
+    def kill_the_first(stream):
+        for state in stream:
+            workers = list(state.grid.pool.workers.values())
+            if not killed and workers and workers[0].task.runs[0].evaluations:
+                killed.append(workers[0].process.process.pid)
+                os.kill(killed[0], number)
+        return state
+
+    how = {"max_updates": 3000, "resources": chosen_resources(workers=1)}
+    stopped = tune(tmp_path, 2, show=kill_the_first, **how)
+    assert set(stopped.hindered) == {0}
+    assert stopped.trials == 0
+    assert stopped.page is None
+    gone_on = tune(tmp_path, 2, **how)
+    assert (gone_on.hindered, gone_on.trials) == ({}, 2)
+    assert gone_on.own_value is not None
+
+
+def test_evaluations_that_cannot_be_read_stop_their_trial_only(tmp_path):
+    tune(tmp_path, 1)
+    (evaluations,) = tmp_path.glob("runs/*/trial-0000/*/seed-0/evaluations.csv")
+    journal = tmp_path / "trials.jsonl"
+    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:-1]))  # the value was not told yet
+    whole = evaluations.read_text()
+    evaluations.write_text(whole.replace("1,", "x,", 1))
+    hindered = tune(tmp_path, 1).hindered
+    assert "evaluations.csv is damaged" in hindered[0]
+    evaluations.write_text(whole)
+    assert tune(tmp_path, 1).trials == 1
+
+
+def test_a_damaged_journal_is_a_users_error(tmp_path):
+    for content in ("[]\n", '{"op_code": 99, "worker_id": "x"}\n', "no json\n{}\n"):
+        (tmp_path / "trials.jsonl").write_text(content)
+        with pytest.raises(saclab.UserError, match="is damaged, or no journal of Optuna's"):
+            open_study(tmp_path, plan_of())
+
+
+def test_seeds_and_settings_that_cannot_be_are_refused():
+    with pytest.raises(saclab.UserError, match=r"seeds = \(0, 0\): name each once"):
+        plan_of(seeds=[0, 0])
+    with pytest.raises(saclab.UserError, match="use Python's own numbers"):
+        make_plan("Pendulum-v1", "sac", "quick", 1, "mean", None, {}, {"polyak_rate": np.float32(0.1)}, {}, 0, True)
 
 
 def test_a_torn_last_line_of_the_journal_is_cut_off(tmp_path):

@@ -22,10 +22,11 @@ class How:
     workers: int | None = None
     """Runs at a time; None for one per core, or on Ray as many as the cluster has room for."""
     threads: int | None = None
-    """Cores that XLA uses for each run; None for one."""
+    """Cores that XLA uses for each run, or for a run group; None for one, or for all. Results depend on it in the last
+    bits."""
     batch: int | None = None
-    """Runs of one trial that are trained together, as one run group; 0 for each alone, None for 16 on an accelerator,
-    else 0."""
+    """Runs of one trial that are trained together, as one run group, one trial at a time; 0 for each alone, None for 16
+    on an accelerator, else 0."""
     launcher: Literal["local", "ray"] = "local"
     """Processes on this machine, or a Ray cluster whose machines share the tune's folder; needs the extra `ray`."""
     ray_address: str | None = None
@@ -44,8 +45,8 @@ class How:
 class Tune:
     """Search for better settings of a variant with Optuna, then write a page; needs the extra `tune`.
 
-    The first trial has the variant's own settings. The same command goes on after a stop. The settings shown below are
-    the protocol's; one that is given holds for every trial and is not searched.
+    The first trial has the variant's own settings, if they lie in the space. The same command goes on after a stop. The
+    settings shown below are the protocol's; one that is given holds for every trial and is not searched.
     """
 
     environment: Positional[str]
@@ -59,7 +60,9 @@ class Tune:
     trials: int = 50
     """How many, those before a stop counted in."""
     seeds: int = 1
-    """Runs of each trial, whose mean is its worth."""
+    """Runs of each trial, whose mean is its worth; their seeds are counted from first_seed."""
+    first_seed: int = 0
+    """The other seeds follow it."""
     objective: Literal["mean", "final", "steps", "seconds"] = "mean"
     """Evaluation return: its mean over training, or that of the last; or the way until an evaluation reaches score."""
     score: float | None = None
@@ -85,8 +88,9 @@ class Tune:
             how.workers, how.threads, how.batch, how.launcher, how.ray_address, how.ray_cpus, how.ray_gpus
         )
         result = tune(
-            self.environment, self.variant, self.protocol, self.trials, seeds=self.seeds, objective=self.objective,
-            score=self.score, space=self.space, pruning=not self.no_pruning, search_seed=self.search_seed, out=self.out,
+            self.environment, self.variant, self.protocol, self.trials,
+            seeds=range(self.first_seed, self.first_seed + self.seeds), objective=self.objective, score=self.score,
+            space=self.space, pruning=not self.no_pruning, search_seed=self.search_seed, out=self.out,
             environment_arguments=parse_arguments(how.environment_arguments), resources=resources,
             checkpoint_minutes=how.checkpoint_minutes, show=lambda stream: display.show_tune(stream, console),
             **self.algorithm, **self.training,

@@ -41,7 +41,7 @@ def launch(
     statuses = make_statuses(cells)
     with pool as workers:
         grid = Grid(workers, make_tasks(statuses, batch), batch)
-        grid.note()
+        grid.note(grid.waiting)
         while grid.running or (grid.waiting and not requests.stop):
             if requests.stop:
                 grid.stop()
@@ -60,8 +60,8 @@ class Grid:
     waiting: list[Task]
     batch: int
     running: list[Task] = field(default_factory=list)
-    given_up: set[Task] = field(default_factory=set)
-    """Tasks that were told to stop while the others go on."""
+    given_up: set[Path] = field(default_factory=set)
+    """Folders of runs that are to go no further, while the others do."""
     losses: dict[Path, tuple[int, int]] = field(default_factory=dict)
     """Run folder -> workers lost since its newest checkpoint, and that one's step."""
     stopping: bool = False
@@ -69,9 +69,9 @@ class Grid:
     """Whether a task waits for another process."""
     next_look: float = 0.0
 
-    def note(self) -> None:
-        """Let the waiting runs say what the pool has to say of them."""
-        for task in self.waiting:
+    def note(self, tasks: Sequence[Task]) -> None:
+        """Let runs that wait say what the pool has to say of them."""
+        for task in tasks:
             for run in task.runs:
                 run.warnings += [self.pool.note] if self.pool.note else []
 
@@ -108,14 +108,28 @@ class Grid:
 
     def give_up(self, runs: Sequence[RunStatus]) -> None:
         """Let some runs go no further, while the others do; a run group ends only as a whole."""
-        tasks = [task for task in (*self.waiting, *self.running) if all(run in runs for run in task.runs)]
-        for task in [task for task in tasks if task not in self.given_up]:
-            self.given_up.add(task)
-            if task in self.running and self.pool.stop(task):
-                continue
-            (self.running if task in self.running else self.waiting).remove(task)
-            for run in task.runs:
-                run.status = run.status if run.status == "finished" else "interrupted"
+        new = [task for task in (*self.waiting, *self.running) if not self._is_given_up(task)]
+        self.given_up |= {run.cell.folder for run in runs}
+        for task in filter(self._is_given_up, new):
+            if task in self.waiting:
+                self.waiting.remove(task)
+                self._lay_down(task)
+            elif not self.pool.stop(task):  # it had not begun
+                self.running.remove(task)
+                self._lay_down(task)
+
+    def _is_given_up(self, task: Task) -> bool:
+        return all(run.cell.folder in self.given_up for run in task.runs)
+
+    def _lay_down(self, task: Task) -> None:
+        for run in task.runs:
+            run.status = run.status if run.status in ("finished", "failed") else "interrupted"
+
+    def _wait_for_room(self, task: Task) -> None:
+        """Let the runs of a task that wait again be taken up anew, unless they are given up."""
+        if self._is_given_up(task):
+            self._lay_down(task)
+        self.waiting[:0] = make_tasks(task.runs, self.batch)
 
     def listen(self) -> None:
         """Take in what the workers say, and how they end."""
@@ -142,13 +156,13 @@ class Grid:
             self._lost(task, how_it_ended(end.code, end.words))
             return
         task.ended(end.code, stopping, end.words)
-        self.waiting[:0] = make_tasks(task.runs, self.batch)  # those of which another process was faster
+        self._wait_for_room(task)  # those of which another process was faster
         if replaced and any(run.status in ("running", "interrupted") for run in task.runs):
             self._lost(task, "told to stop")
 
     def _stopping(self, task: Task) -> bool:
         """Whether a task was told to stop."""
-        return self.stopping or task in self.given_up
+        return self.stopping or self._is_given_up(task)
 
     def _lost(self, task: Task, why: str) -> None:
         """Let the runs that have not ended wait for another worker."""
@@ -160,7 +174,7 @@ class Grid:
                 run.status = "interrupted"
             elif run.status != "failed" and not stopping:
                 self._wait_again(run, why)
-        self.waiting[:0] = make_tasks(task.runs, self.batch)
+        self._wait_for_room(task)
 
     def _wait_again(self, run: RunStatus, why: str) -> None:
         """Let a run wait, or fail if this has happened too often since it got any further."""

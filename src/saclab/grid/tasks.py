@@ -31,6 +31,8 @@ class RunStatus:
     evaluation_return: float | None = None
     message: str = ""
     """Why it failed."""
+    broken: bool = False
+    """Whether something in the run itself was the cause: a number that is not finite, or its environment."""
     warnings: list[str] = field(default_factory=list)
     """What the run said of itself that the user should know."""
     stalled: bool = False
@@ -62,8 +64,8 @@ class RunStatus:
                 self.status = "interrupted"
             case {"event": "in_use"}:
                 self.status = "waiting"
-            case {"event": "failed", "message": str(text)}:
-                self.status, self.message = "failed", text
+            case {"event": "failed", "message": str(text), **more}:
+                self.status, self.message, self.broken = "failed", text, more.get("broken") is True
 
     def lose_worker(self, why: str) -> None:
         """Wait for another worker, which goes on from the last checkpoint."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from saclab.config import Config
 from saclab.environments.foreign import prints_apart
 from saclab.environments.watch import log
+from saclab.errors import RunBroken
 from saclab.exits import end_after
 from saclab.signals import die_with
 from saclab.training.lock import InUse, wait_until_free
@@ -58,7 +59,8 @@ def main() -> int:
         except Exception as error:
             status, line = end_after(error)
             for run in going_on:
-                tell(run, event="in_use" if isinstance(error, InUse) else "failed", message=line)
+                what = "in_use" if isinstance(error, InUse) else "failed"
+                tell(run, event=what, message=line, broken=isinstance(error, RunBroken))
             return status
     return 0
 
@@ -120,7 +122,7 @@ def messages(event: Event) -> Iterator[dict[str, object]]:
         case Finished():
             yield {"event": "finished", "reason": event.reason}
         case Failed(message=message):
-            yield {"event": "failed", "message": message}
+            yield {"event": "failed", "message": message, "broken": True}
         case Interrupted():
             yield {"event": "interrupted"}
 

@@ -221,6 +221,13 @@ def read_run(run: Path) -> RunRecord:
     )
 
 
+def read_evaluations(run: Path, config: Config) -> Table | None:
+    """The evaluations of a run that goes on, as `RunRecord` has them; None if there is none yet. Raises Damaged."""
+    path = run / "evaluations.csv"
+    table = table_from_csv(path, read_log(path, None, grows=True), EVALUATIONS, EVALUATION_TYPES)
+    return with_matrices(path, table, config.training.evaluation_episodes) if table else None
+
+
 def read_log(path: Path, recorded: FileRecord | None, grows: bool) -> bytes:
     """A log; nothing if there is none and nothing is recorded of it. Raises Damaged."""
     try:

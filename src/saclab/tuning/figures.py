@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from saclab.report.text import shown
 from saclab.tuning.plan import TunePlan
@@ -19,10 +21,7 @@ from saclab.tuning.study import ended_trials, is_complete
 if TYPE_CHECKING:
     import optuna
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from optuna.trial import FrozenTrial
-
-matplotlib.use("agg")
 
 COLOURS = "viridis_r"
 DARK, LIGHT = "#0072b2", "#bbbbb6"
@@ -122,6 +121,8 @@ def marks(dimension: Range | Choice) -> Sequence[Any]:
     match dimension:
         case Choice(choices):
             return choices
+        case Range(int(low), int(high), log):
+            return low, round(math.sqrt(low * high) if log else (low + high) / 2), high
         case Range(low, high, log):
             return low, math.sqrt(low * high) if log else (low + high) / 2, high
 
@@ -156,24 +157,21 @@ def courses(study: optuna.Study) -> bytes:
     figure, axes = new_figure(6, 3.2)
     for trial in study.trials:
         steps, values = list(trial.intermediate_values), list(trial.intermediate_values.values())
-        axes.plot(steps, values, color=DARK if is_complete(trial) else LIGHT, linewidth=1)
+        axes.plot(steps, values, color=LIGHT if trial.state.name == "PRUNED" else DARK, linewidth=1)
     axes.set(xlabel="evaluation", ylabel="value so far")
     return picture(figure)
 
 
 def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots()
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
 
 
 def picture(figure: Figure) -> bytes:
-    """A figure as a PNG; it is closed."""
-    import matplotlib.pyplot as plt
-
+    """A figure as a PNG."""
     content = io.BytesIO()
+    FigureCanvasAgg(figure)
     figure.savefig(content, format="png", dpi=110)
-    plt.close(figure)
     return content.getvalue()

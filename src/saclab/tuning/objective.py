@@ -67,6 +67,11 @@ class Objective(NamedTuple):
         """Whether nothing that a run may still do changes its value."""
         return self.kind.to_score and bool((evaluations["mean_return"] >= self.score).any())
 
+    def before_score(self, evaluations: Evaluations) -> Evaluations:
+        """The evaluations before the first that reaches the score; all if none does."""
+        reached = np.flatnonzero(evaluations["mean_return"] >= self.score)
+        return {name: column[: reached[0]] for name, column in evaluations.items()} if reached.size else evaluations
+
     def at_least(self, runs: Sequence[Evaluations | None], ended: Sequence[bool]) -> float:
         """Of a way to a score: what the trial's value will be at least, with what its runs have spent so far."""
         spent = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import shlex
-import textwrap
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from string import Template
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import optuna
     from optuna.trial import FrozenTrial
 
+LINE_LETTERS = 100
 FRESH_SEED, FRESH_SEEDS = 1000, 5
 """The seeds of the commands that judge the best settings: others than the trials'."""
 LINES = 100
@@ -95,12 +96,14 @@ def best_html(study: optuna.Study, plan: TunePlan, folder: Path) -> str:
     settings = values_of(plan.space, best.params)
     rows = [(name, value_text(own), value_text(settings[name])) for name, own in plan.own_values.items()]
     own = own_trial(study, plan)
-    against = f", against {own.value:.4g} of the variant's own (trial {own.number})" if own and own.value else ""
+    if own is not None and own.number == best.number:
+        return f"<p>Nothing better than the variant's own settings was found: trial {own.number}, {own.value:.4g}.</p>"
+    against = f", against {own.value:.4g} of the variant's own (trial {own.number})" if own is not None else ""
     caveat = (
         "It is the best of many noisy ones, so the value flatters: the commands train it and the variant's own "
         f"settings with {FRESH_SEEDS} seeds that no trial had, and compare them."
     )
-    commands = "\n".join(map(folded, judging_commands(plan, settings)))
+    commands = "\n".join(map(folded, judging_commands(plan, settings, best.number, folder)))
     return (
         f"<p>Trial {best.number}: {best.value:.4g}{against}. {caveat}</p>"
         f"{table_html(Table('Best settings', ('setting', 'own value', 'best'), tuple(rows)), headed=True)}"
@@ -108,33 +111,41 @@ def best_html(study: optuna.Study, plan: TunePlan, folder: Path) -> str:
     )
 
 
-def folded(command: str) -> str:
+def folded(words: Sequence[str]) -> str:
     """A command over several lines, as a shell takes it."""
-    return " \\\n    ".join(textwrap.wrap(command, 110, break_long_words=False, break_on_hyphens=False))
+    lines = [""]
+    for word in map(shlex.quote, words):
+        if len(lines[-1]) + len(word) > LINE_LETTERS:
+            lines.append("")
+        lines[-1] += f" {word}" if lines[-1] else word
+    return " \\\n    ".join(lines)
 
 
 def own_trial(study: optuna.Study, plan: TunePlan) -> FrozenTrial | None:
     """The trial of the variant's own settings, if it came to its end."""
-    first = study.trials[0]
-    return first if plan.starts_from_own and is_complete(first) else None
+    first = study.trials[0] if study.trials and not plan.own_outside else None
+    return first if first is not None and is_complete(first) else None
 
 
-def judging_commands(plan: TunePlan, settings: dict[str, Any]) -> list[str]:
-    """Commands that compare these settings with the variant's own, on seeds that no trial had."""
+def judging_commands(plan: TunePlan, settings: Mapping[str, Any], number: int, folder: Path) -> list[list[str]]:
+    """The words of commands that compare a trial's settings with the variant's own, on seeds that no trial had."""
     first = max(FRESH_SEED, max(plan.seeds) + 1)
+    runs, name = folder / "judged", f"{plan.variant}-{trial_name(number)}"
     common = ["saclab", "compare", plan.environment, "--variants", plan.variant, "--protocol", plan.protocol,
-              "--seeds", str(FRESH_SEEDS), "--first-seed", str(first), *option_words(plan.overrides)]  # fmt: skip
+              "--seeds", str(FRESH_SEEDS), "--first-seed", str(first), "--runs", str(runs),
+              *option_words(plan.overrides)]  # fmt: skip
     if plan.environment_arguments:
         common += ["--environment-arguments", json.dumps(plan.environment_arguments)]
-    tuned = [*common, "--name", f"{plan.variant}-tuned", *option_words(settings)]
-    names = (plan.variant, f"{plan.variant}-tuned")
-    folders = [str(run_path(Path("runs"), plan.config({}, first), name).parent) for name in names]
-    mixed = ["--allow-mixed"] if any(name in field_names(TrainingSettings) for name in settings) else []
-    report = ["saclab", "report", *folders, *mixed, "--out", f"report-{plan.variant}-tuned"]
-    return [shlex.join(words) for words in (common, tuned, report)]
+    arms = [str(run_path(runs, plan.config({}, first), arm).parent) for arm in (plan.variant, name)]
+    mixed = ["--allow-mixed"] if any(setting in field_names(TrainingSettings) for setting in settings) else []
+    return [
+        common,
+        [*common, "--name", name, *option_words(settings)],
+        ["saclab", "report", *arms, *mixed, "--out", str(runs / "report")],
+    ]
 
 
-def option_words(settings: dict[str, Any]) -> list[str]:
+def option_words(settings: Mapping[str, Any]) -> list[str]:
     return [word for name, value in settings.items() for word in ("--" + name.replace("_", "-"), *flag_values(value))]
 
 

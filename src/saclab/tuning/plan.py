@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saclab.config import Config
-from saclab.errors import SettingError, UserError, require
+from saclab.config import Config, is_json
+from saclab.errors import SettingError, UserError, require, shown
 from saclab.grid.plan import Cell, seed_numbers
 from saclab.protocols import make_config
 from saclab.records import JSON_BYTES, Damaged, Missing, read_bytes
@@ -47,10 +47,16 @@ class TunePlan:
             {**self.overrides, **settings},
         )  # fmt: skip
 
-    def cells(self, folder: Path, number: int, settings: Mapping[str, Any]) -> list[Cell]:
+    def cells(self, folder: Path, name: str, settings: Mapping[str, Any]) -> list[Cell]:
         """The runs of a trial; raises UserError for settings that cannot work together."""
         configs = [self.config(settings, seed) for seed in self.seeds]
-        return [Cell(config, run_path(folder / "runs", config, trial_name(number))) for config in configs]
+        return [Cell(config, run_path(folder / "runs", config, name)) for config in configs]
+
+    def extremes(self, folder: Path) -> list[Cell]:
+        """The runs of the variant's own settings, and of each end of the space: what must be possible at least."""
+        changes: list[dict[str, Any]] = [{}]
+        changes += [{name: end} for name, dimension in self.space.items() for end in dimension.ends]
+        return [cell for change in changes for cell in self.cells(folder, "extreme", change)[:1]]
 
     @property
     def own_values(self) -> dict[str, Any]:
@@ -62,9 +68,9 @@ class TunePlan:
         }
 
     @property
-    def starts_from_own(self) -> bool:
-        """Whether the variant's own values lie in the space, so that the first trial tries them."""
-        return all(self.space[name].holds(value) for name, value in self.own_values.items())
+    def own_outside(self) -> dict[str, Any]:
+        """The variant's own values that do not lie in the space: if there are none, the first trial tries them all."""
+        return {name: value for name, value in self.own_values.items() if not self.space[name].holds(value)}
 
     def to_plain(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -96,8 +102,11 @@ def make_plan(
         UserError: for a name or value that cannot work, in the space too.
     """
     require(0 <= search_seed < 2**31, "search_seed", search_seed, "use a whole number from 0 to 2**31 - 1")
+    numbers = tuple(seed_numbers(seeds, protocol))
+    require(len({*numbers}) == len(numbers), "seeds", numbers, "name each once")
+    require(is_json(dict(overrides)), "overrides", dict(overrides), "use Python's own numbers, texts and lists")
     bare = TunePlan(
-        environment, variant, protocol, tuple(seed_numbers(seeds, protocol)), objective_of(objective, score), {},
+        environment, variant, protocol, numbers, objective_of(objective, score), {},
         dict(overrides), dict(environment_arguments), search_seed, pruning,
     )  # fmt: skip
     plan = dataclasses.replace(bare, space=changed_space(possible_defaults(bare), space))
@@ -142,11 +151,24 @@ def is_recorded(folder: Path, plan: TunePlan) -> bool:
         return False
     except ValueError as error:
         raise Damaged(path, error) from error
-    for name, value in plan.to_plain().items():
-        if not isinstance(theirs, dict) or theirs.get(name) != value:
-            there = theirs.get(name) if isinstance(theirs, dict) else theirs
-            raise UserError(
-                f"{folder} holds a tune with another {name}: {there!r} there, {value!r} here: give the same command to "
-                "go on with it, or another folder with --out"
-            )
+    mine = plan.to_plain()
+    if mine != theirs:
+        name, here, there = first_difference(mine, theirs)
+        raise UserError(
+            f"{folder} holds a tune with another {name}: {shown(there)} there, {shown(here)} here: give the same "
+            "command to go on with it, or another folder with --out"
+        )
     return True
+
+
+def first_difference(mine: Mapping[str, Any], theirs: Any) -> tuple[str, Any, Any]:
+    """The first name whose value differs, with both values; inside of dictionaries, by both names."""
+    theirs = theirs if isinstance(theirs, dict) else {}
+    for name in (*mine, *theirs):
+        here, there = mine.get(name), theirs.get(name)
+        if here != there and isinstance(here, dict) and isinstance(there, dict):
+            inner, here, there = first_difference(here, there)
+            return f"{name}, {inner}", here, there
+        if here != there:
+            return name, here, there
+    raise AssertionError("they are equal")

@@ -121,7 +121,9 @@ def changed_space(space: Space, changes: Mapping[str, Any]) -> Space:
         UserError: for a name that is no setting, or one that cannot be searched, or values of another type.
     """
     changes = dict(changes)
-    found: Space = {} if changes.pop("defaults", True) is False else dict(space)
+    defaults = changes.pop("defaults", True)
+    require(isinstance(defaults, bool), "space", f"defaults = {defaults!r}", "write true or false")
+    found: Space = dict(space) if defaults else {}
     for name, entry in changes.items():
         require_searchable(name)
         if entry is False:

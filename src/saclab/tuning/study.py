@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from saclab.errors import UserError
+from saclab.errors import UserError, in_words
 from saclab.extras import required
 from saclab.tuning.plan import TunePlan
 from saclab.tuning.space import plain, suggested_value
@@ -47,16 +47,16 @@ def open_study(folder: Path, plan: TunePlan) -> optuna.Study:
     module = required("optuna", "tune", "saclab tune")
     module.logging.set_verbosity(module.logging.WARNING)
     path = folder / JOURNAL
-    mend_end(path)
     try:
+        mend_end(path)
         backend = module.storages.journal.JournalFileBackend(str(path), HeldAlready())
         study: optuna.Study = module.create_study(
             storage=module.storages.JournalStorage(backend), study_name=NAME, load_if_exists=True,
             direction=plan.objective.direction, pruner=pruner_of(plan, module),
         )  # fmt: skip
-    except (ValueError, KeyError, OSError) as error:
-        raise UserError(f"{path} is damaged, or no journal of Optuna's: {error}") from error
-    if not study.trials and plan.starts_from_own:
+    except (ValueError, KeyError, TypeError, AssertionError, OSError) as error:
+        raise UserError(f"{path} is damaged, or no journal of Optuna's: {in_words(error)}") from error
+    if not study.trials and not plan.own_outside:
         study.enqueue_trial({name: plain(value) for name, value in plan.own_values.items()})
     return study
 
@@ -93,16 +93,17 @@ def drawn_settings(study: optuna.Study, plan: TunePlan, trial: Trial) -> dict[st
 
 
 def seed_sampler(study: optuna.Study, plan: TunePlan, trial: int, place: int = 0) -> None:
-    """Let what is drawn next depend on the trial's number, the setting's place and the values of earlier trials only.
+    """Let what is drawn next depend on the trial's number, the setting's place and the other trials so far only.
 
-    So a tune that was killed between two draws goes on with those that it would have made.
+    So a tune that was killed between two draws goes on with those that it would have made. Trials under way count as
+    well, by their settings: with several workers none is drawn next to them (the constant liar).
     """
     import optuna
 
     seed = np.random.SeedSequence((plan.search_seed, trial, place)).generate_state(1)[0]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what Optuna calls experimental
-        study.sampler = optuna.samplers.TPESampler(seed=int(seed))
+        study.sampler = optuna.samplers.TPESampler(seed=int(seed), multivariate=True, constant_liar=True)
 
 
 def ended_trials(study: optuna.Study) -> list[FrozenTrial]:

@@ -33,9 +33,11 @@ class Tuned(NamedTuple):
     """What the variant's own settings are worth; None if they do not lie in the space, or were not tried yet."""
     trials: int
     """How many have ended."""
-    commands: list[str]
-    """What judges the best settings against the variant's own, with seeds that no trial had."""
+    commands: list[list[str]]
+    """The words of commands that judge the best settings against the variant's own, with seeds that no trial had."""
     page: Path | None
+    hindered: dict[int, str] = {}  # noqa: RUF012 - a NamedTuple's default, which nobody changes
+    """Trials that something from outside has stopped, and what; the same call goes on with them."""
     interrupted: int = 0
     """The signal that stopped the tune, or 0."""
 
@@ -67,7 +69,8 @@ def tune(
         environment: Gymnasium id.
         variant: a key of `saclab.variants.VARIANTS`.
         protocol: a key of `saclab.protocols.PROTOCOLS`.
-        trials: how many, those of earlier calls counted in; the first has the variant's own settings.
+        trials: how many, those of earlier calls counted in; the first has the variant's own settings, if they lie in
+            the space.
         seeds: how many runs a trial has, or their seeds; its worth is their mean.
         objective: evaluation return to be high, its "mean" over training or the "final" one; or "steps" or "seconds"
             to be low, until an evaluation reaches `score`.
@@ -103,7 +106,7 @@ def tuned(
     require(trials >= 1, "trials", trials, "use at least 1")
     require_minutes(checkpoint_minutes)
     is_recorded(folder, plan)
-    resources.require_startable(plan.cells(folder, 0, {}))
+    resources.require_startable(plan.extremes(folder))
     with requests_from_signals() as requests:
         state = show(search(plan, folder, trials, resources.pool(checkpoint_minutes), requests, resources.batch))
     best, own = best_trial(state.study), own_trial(state.study, plan)
@@ -113,8 +116,9 @@ def tuned(
         None if best is None else best.value,
         None if own is None else own.value,
         len(state.ended),
-        judging_commands(plan, settings) if settings else [],
+        judging_commands(plan, settings, best.number, folder) if best is not None and settings else [],
         write_page(state.study, plan, folder),
+        state.hindered,
         requests.stop,
     )
 

@@ -13,11 +13,10 @@ from saclab.errors import TrainingFailed, UserError
 from saclab.files import write_json
 from saclab.grid.launch import Grid
 from saclab.grid.pool import WorkerPool
-from saclab.grid.tasks import RunStatus, make_statuses, make_tasks
+from saclab.grid.tasks import make_statuses, make_tasks
 from saclab.training.lock import locked
 from saclab.training.requests import Requests
-from saclab.training.run_folder import read_run
-from saclab.tuning.objective import Evaluations
+from saclab.tuning.open_trial import OpenTrial
 from saclab.tuning.plan import PLAN, TunePlan, is_recorded, trial_name
 from saclab.tuning.study import WHY, best_trial, drawn_settings, ended_trials, open_study, trials_under_way
 
@@ -27,44 +26,6 @@ if TYPE_CHECKING:
 
 FAILURES = 5
 """Trials that fail before any has succeeded; then the cause is not their settings."""
-
-
-@dataclass
-class OpenTrial:
-    """A trial whose runs are trained."""
-
-    trial: Trial
-    settings: dict[str, Any]
-    runs: list[RunStatus]
-    evaluations: list[Evaluations | None] = field(init=False)
-    """Of each run, once it has any."""
-    read: list[tuple[int, bool]] = field(init=False)
-    """Of each run, how many evaluations there were when they were read last, and whether it had ended."""
-    given_up: str = ""
-    """Why, if it was."""
-
-    def __post_init__(self) -> None:
-        self.evaluations = [None] * len(self.runs)
-        self.read = [(0, False)] * len(self.runs)
-
-    @property
-    def at_rest(self) -> bool:
-        return all(run.status in ("finished", "interrupted", "failed") for run in self.runs)
-
-    @property
-    def failure(self) -> str:
-        """Why a run of it failed, if one has."""
-        return next((run.message for run in self.runs if run.status == "failed"), "")
-
-    def look(self) -> bool:
-        """Read the evaluations of the runs that have news; whether there were any."""
-        news = False
-        for place, run in enumerate(self.runs):
-            state = run.evaluations, run.status == "finished"
-            if state != self.read[place]:
-                self.read[place], news = state, True
-                self.evaluations[place] = read_run(run.cell.folder).evaluations
-        return news
 
 
 @dataclass
@@ -82,6 +43,8 @@ class Tune:
     ended: list[FrozenTrial] = field(default_factory=list)
     ended_before: int = 0
     """Trials that had ended when this session began."""
+    hindered: dict[int, str] = field(default_factory=dict)
+    """Trials that something from outside has stopped, and what; the same command goes on with them."""
 
     def begin(self) -> None:
         """Take up the trials that a stop has left, then begin new ones while there is room."""
@@ -107,15 +70,16 @@ class Tune:
     def goes_on(self, stopping: bool) -> bool:
         if stopping:
             return bool(self.grid.running)
-        return bool(self.open) or self._left()
+        return bool(self.open) or self._begins_more()
 
-    def _left(self) -> bool:
-        """Whether trials are still to be begun."""
-        return sum(trial.state.name != "WAITING" for trial in self.study.trials) < self.trials
+    def _begins_more(self) -> bool:
+        """Whether trials are still to be begun; none is where something from outside hinders them."""
+        begun = sum(trial.state.name != "WAITING" for trial in self.study.trials)
+        return begun < self.trials and not self.hindered
 
     def _has_room(self) -> bool:
         """Whether a new trial's first run could begin now: it should know of as many others as it can."""
-        if not self._left() or self.grid.waiting:
+        if not self._begins_more() or self.grid.waiting:
             return False
         places = self.grid.pool.places
         if places is None:
@@ -126,62 +90,43 @@ class Tune:
         """Let a trial's runs be trained; settings that cannot work together are told and left."""
         settings = drawn_settings(self.study, self.plan, trial)
         try:
-            cells = self.plan.cells(self.folder, trial.number, settings)
+            cells = self.plan.cells(self.folder, trial_name(trial.number), settings)
         except UserError as error:
             self._tell(trial, None, str(error))
             return
-        opened = OpenTrial(trial, settings, make_statuses(cells))
+        opened = OpenTrial(trial, make_statuses(cells))
         self.open.append(opened)
-        self.grid.waiting += make_tasks(opened.runs, self.batch)
+        tasks = make_tasks(opened.runs, self.batch)
+        self.grid.note(tasks)
+        self.grid.waiting += tasks
 
     def _judge(self, trial: OpenTrial, stopping: bool) -> None:
         """Give a trial up, end runs that have nothing more to show, or tell its value."""
-        if (trial.look() or trial.failure) and not stopping:
-            self._end_early(trial)
-        if not trial.at_rest:
+        objective, news = self.plan.objective, trial.look()
+        if stopping and not trial.is_whole(objective):
             return
-        if trial.given_up:
-            self._close(trial, None, trial.given_up)
-        elif all(run.status == "finished" or self._reached(trial, place) for place, run in enumerate(trial.runs)):
-            self._close(trial, self.plan.objective.value([found for found in trial.evaluations if found is not None]))
-        else:  # somebody has stopped a run: it goes on when the command is given again
-            self.open.remove(trial)
-
-    def _reached(self, trial: OpenTrial, place: int) -> bool:
-        found = trial.evaluations[place]
-        return found is not None and self.plan.objective.reached(found)
-
-    def _end_early(self, trial: OpenTrial) -> None:
-        """Stop what can change nothing any more: a run at its score, a trial that is no good."""
-        if self.plan.objective.kind.to_score:
-            self.grid.give_up([run for place, run in enumerate(trial.runs) if self._reached(trial, place)])
-        if not trial.given_up and (why := trial.failure or self._hopeless(trial)):
+        if objective.kind.to_score and news:
+            self.grid.give_up([run for place, run in enumerate(trial.runs) if trial.reached(place, objective)])
+        if not trial.given_up and (why := trial.broken or self._hopeless(trial, news)):
             trial.given_up = why
+        if trial.given_up or trial.hindrance(objective):
             self.grid.give_up(trial.runs)
+        if trial.at_rest:
+            self._end(trial)
 
-    def _hopeless(self, trial: OpenTrial) -> str:
-        """Why a trial is given up by its evaluations; empty if it is not."""
-        objective = self.plan.objective
-        if not self.plan.pruning or trial.at_rest:
-            return ""
-        if objective.kind.to_score:
-            best = best_trial(self.study)
-            least = objective.at_least(trial.evaluations, [run.status == "finished" for run in trial.runs])
-            if best is None or best.value is None or least <= best.value:
-                return ""
-            return f"it needs more than the best so far, {best.value:.4g}"
-        columns = [found["mean_return"] for found in trial.evaluations if found is not None]
-        if len(columns) < len(trial.runs):
-            return ""
-        reported = self.study.trials[trial.trial.number].intermediate_values
-        for count in range(len(reported) + 1, min(map(len, columns)) + 1):
-            trial.trial.report(objective.value([{"mean_return": column[:count]} for column in columns]), count)
-        return "it was below the median of the trials before it" if trial.trial.should_prune() else ""
+    def _hopeless(self, trial: OpenTrial, news: bool) -> str:
+        judged = news and self.plan.pruning and not trial.unreadable
+        return trial.hopeless(self.plan.objective, self.study) if judged else ""
 
-    def _close(self, trial: OpenTrial, value: float | None, why: str = "") -> None:
+    def _end(self, trial: OpenTrial) -> None:
+        """Tell what came of a trial whose runs are at rest."""
         self.open.remove(trial)
-        self._tell(trial.trial, value, why)
-        self._clear(trial.trial.number)
+        number, whole = trial.trial.number, trial.is_whole(self.plan.objective)
+        if not trial.given_up and not whole:
+            self.hindered[number] = trial.hindrance(self.plan.objective)
+            return
+        self._tell(trial.trial, None if trial.given_up else trial.value(self.plan.objective), trial.given_up)
+        self._clear(number)
 
     def _tell(self, trial: Trial, value: float | None, why: str) -> None:
         """Tell the study what a trial is worth, or why it was given up; raises TrainingFailed if all are."""
@@ -190,7 +135,10 @@ class Tune:
         self.study.tell(trial.number, value, None if value is not None else pruned())
         self.ended = ended_trials(self.study)
         if len(self.ended) >= FAILURES and best_trial(self.study) is None:
-            raise TrainingFailed(f"none of the first {len(self.ended)} trials came to its end; the last one: {why}")
+            raise TrainingFailed(
+                f"none of the first {len(self.ended)} trials came to its end; the last one: {why}: change what is "
+                "searched or what holds for every trial, in another folder (--out)"
+            )
 
     def _clear(self, number: int) -> None:
         """Remove the checkpoints of an ended trial's runs: nothing goes on from them, and they are large."""

@@ -20,7 +20,7 @@ from saclab.trained_policy import on_disk
 def no_token(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(hub.library("test").constants, "HF_TOKEN_PATH", str(tmp_path / "token"))
+    monkeypatch.setattr(hub.library().constants, "HF_TOKEN_PATH", str(tmp_path / "token"))
 
 
 @pytest.mark.usefixtures("no_token")

@@ -46,7 +46,7 @@ def parsed(address: Path | str) -> Address:
 
 def require_name(repository: str) -> None:
     """Raise SettingError for what the Hub takes for no user/name."""
-    utils = library("share").utils
+    utils = library().utils
     try:
         utils.validate_repo_id(repository)
         reason = "" if repository.count("/") == 1 else "write user/name"
@@ -55,9 +55,9 @@ def require_name(repository: str) -> None:
     require(not reason, "repository", repository, reason)
 
 
-def library(option: str) -> Any:
+def library() -> Any:
     """huggingface_hub with the modules of it that it does not import by itself; raises UserError if it is missing."""
-    hub = required("huggingface_hub", "hub", option)
+    hub = required("huggingface_hub", "hub", "the Hugging Face Hub")
     for module in ("constants", "errors", "utils"):
         import_module(f"huggingface_hub.{module}")
     return hub
@@ -73,7 +73,7 @@ def download(address: Path | str, largest: Mapping[str, int]) -> Path:
     Raises:
         UserError: if there is no such model, a file is missing or too large, or the Hub cannot be reached.
     """
-    hub = library(str(address))
+    hub = library()
     repository, revision = parsed(address)
     with told(repository, revision):
         with suppress(hub.errors.OfflineModeIsEnabled):
@@ -94,7 +94,7 @@ def require_files(address: str, sizes: Mapping[str, int | None], largest: Mappin
 
 def require_token() -> None:
     """Raise UserError unless huggingface_hub has a token to upload with."""
-    if library("share").get_token() is None:
+    if library().get_token() is None:
         raise UserError(f"sharing needs a token of the Hugging Face Hub, and there is none: {LOG_IN}")
 
 
@@ -119,7 +119,7 @@ def upload(
         UserError: if the token is refused, the Hub cannot be reached, or the repository is there and public where
             `private` is asked for, or holds another model.
     """
-    hub = library("share")
+    hub = library()
     with told(repository, None):
         api = hub.HfApi()
         page = str(api.create_repo(repository, private=private or None, exist_ok=True))
@@ -149,7 +149,7 @@ def require_own(repository: str, names: Set[str], marks: Set[str]) -> None:
 @contextmanager
 def told(repository: str, revision: str | None) -> Iterator[None]:
     """Say in one line what went wrong between here and the Hub: raises UserError for whatever huggingface_hub does."""
-    hub = library(repository)
+    hub = library()
     errors, at = hub.errors, hub.constants.ENDPOINT
     try:
         yield

@@ -60,7 +60,7 @@ class Card(NamedTuple):
 
     def metadata(self) -> Any:
         """huggingface_hub's ModelCardData; one result, as reinforcement learners have it on the Hub."""
-        hub, result = library("share"), self.result
+        hub, result = library(), self.result
         score = hub.EvalResult(
             task_type="reinforcement-learning",
             task_name="reinforcement-learning",

@@ -69,6 +69,7 @@ PEERS = {
     "Stable-Baselines3": ("stable_baselines3_run.py", "stable-baselines3"),
     "SBX": ("stable_baselines3_run.py", "sbx-rl"),
     "Tianshou": ("tianshou_run.py", "tianshou"),
+    "RLtools": ("rltools_run.py", "rltools"),
 }
 
 

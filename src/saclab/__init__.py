@@ -21,11 +21,12 @@ if TYPE_CHECKING:
     )
     from saclab.training.requests import Requests
     from saclab.training.run_folder import RunRecord, read_run
+    from saclab.tuning.tune import Tuned, tune
 
 __all__ = [
     "Comparison", "EpisodeEnded", "Evaluated", "Finished", "Interrupted", "Progress", "Requests", "RunRecord", "Saved",
-    "Started", "TrainedPolicy", "TrainingFailed", "UpdatesLogged", "UserError", "Warned", "compare", "events",
-    "load_policy", "read_run", "resume", "train",
+    "Started", "TrainedPolicy", "TrainingFailed", "Tuned", "UpdatesLogged", "UserError", "Warned", "compare", "events",
+    "load_policy", "read_run", "resume", "train", "tune",
 ]  # fmt: skip
 
 _HOMES = {
@@ -38,6 +39,7 @@ _HOMES = {
     ),
     "saclab.training.requests": ("Requests",),
     "saclab.training.run_folder": ("RunRecord", "read_run"),
+    "saclab.tuning.tune": ("Tuned", "tune"),
 }  # fmt: skip
 
 

@@ -72,7 +72,7 @@ def test_arguments_of_every_environment_are_tried(tmp_path: Path) -> None:
 def test_a_status_takes_in_what_a_worker_says(tmp_path: Path) -> None:
     status = RunStatus(grid(tmp_path)[0])
     status.enter({"event": "progress", "fraction": 0.25, "updates": 50, "episodes": 1, "steps": 150, "seconds": 1.0})
-    status.enter({"event": "evaluated", "mean_return": -3.5, "updates": 50})
+    status.enter({"event": "evaluated", "mean_return": -3.5, "evaluation": 2})
     status.enter({"event": "warned", "message": "look"})
     assert (status.fraction, status.updates, status.evaluation_return, status.warnings) == (0.25, 50, -3.5, ["look"])
     status.enter({"event": "failed", "message": "why"})

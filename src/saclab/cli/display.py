@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.live import Live
@@ -19,7 +19,15 @@ from saclab.grid.tasks import RunStatus
 from saclab.protocols import Protocol
 from saclab.signals import EXIT_STATUS
 from saclab.training import events
+from saclab.tuning.plan import TunePlan
+from saclab.tuning.space import value_text, values_of
+from saclab.tuning.study import WHY, is_complete
+from saclab.tuning.tune import Tuned
+from saclab.tuning.tuner import Tune
 from saclab.variants import Variant
+
+if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial
 
 PLAIN_SECONDS = 20  # between two lines of a grid's progress that goes to a file or a pipe
 
@@ -157,6 +165,52 @@ def show_comparison(result: Comparison, console: Console) -> int:
             console.print(ONE_SEED, highlight=False, soft_wrap=True)
         console.print(f"report: {result.report.resolve()}", markup=False, soft_wrap=True)
     return 1 if result.failed else 0
+
+
+def show_tune(stream: Iterable[Tune], console: Console) -> Tune:
+    """Show a tune until its end: a line for each trial that ends, the runs under way on a terminal; its last state."""
+    told, last_line, state = -1, time.monotonic(), None
+    with Live(console=console, refresh_per_second=4, transient=True, auto_refresh=console.is_terminal) as live:
+        for state in stream:
+            if told < 0:
+                told = state.ended_before
+                console.print(
+                    f"{told} of {state.trials} trials have ended already" if told else f"{state.trials} trials"
+                )
+            for trial in state.ended[told:]:
+                console.print(trial_line(trial, state.plan), markup=False, highlight=False, soft_wrap=True)
+            told = len(state.ended)
+            runs = [run for trial in state.open for run in trial.runs]
+            if console.is_terminal:
+                live.update(grid_table(runs, rows=max(5, console.height - 6)))
+            elif time.monotonic() - last_line > PLAIN_SECONDS:
+                last_line = time.monotonic()
+                console.print(f"{told} of {state.trials} trials ended | {grid_line(runs)}", soft_wrap=True)
+    assert state is not None
+    return state
+
+
+def trial_line(trial: FrozenTrial, plan: TunePlan) -> str:
+    """What came of a trial, with its settings."""
+    value = f"{trial.value:.4g}" if is_complete(trial) else f"given up: {trial.user_attrs.get(WHY)}"
+    settings = values_of(plan.space, trial.params)
+    listed = ", ".join(f"{name} {value_text(value)}" for name, value in settings.items())
+    return f"trial {trial.number}: {value}  ({listed})"
+
+
+def show_tuned(result: Tuned, console: Console) -> int:
+    """Say what a tune has found, and where its page lies; the exit status."""
+    if result.best is not None:
+        own = "" if result.own_value is None else f", against {result.own_value:.4g} of the variant's own settings"
+        console.print(f"best: {result.value:.4g}{own}; judge it on seeds that no trial had:", soft_wrap=True)
+        for command in result.commands:
+            console.print(f"  {command}", markup=False, highlight=False, soft_wrap=True)
+    if result.page is not None:
+        console.print(f"page: {result.page}", markup=False, soft_wrap=True)
+    if result.interrupted:
+        console.print("saved; the same command continues where it stopped")
+        return EXIT_STATUS.get(result.interrupted, 1)
+    return 0
 
 
 def catalogue(rows: Mapping[str, tuple[str, Mapping[str, Any]]]) -> Table:

@@ -15,6 +15,7 @@ from saclab.cli.results import Evaluate, Export, Protocols, Record, Report, Shar
 from saclab.cli.settings import with_absolute_paths, with_settings
 from saclab.cli.streams import output_lost, use_lasting_streams
 from saclab.cli.training import Compare, Reproduce, Resume, Train
+from saclab.cli.tuning import Tune
 from saclab.errors import for_terminal
 from saclab.exits import EXIT_FAILED, end_after
 
@@ -52,10 +53,11 @@ def run(arguments: Sequence[str]) -> int:
 
 def parse(arguments: Sequence[str]) -> Any:
     """The command that the words ask for."""
-    train, compare = with_settings(Train, arguments), with_settings(Compare, arguments)
+    train, compare, tune = (with_settings(command, arguments) for command in (Train, Compare, Tune))
     commands: Any = (
         Annotated[train, subcommand("train")]
         | Annotated[compare, subcommand("compare")]
+        | Annotated[tune, subcommand("tune")]
         | Annotated[Reproduce, subcommand("reproduce")]
         | Annotated[Resume, subcommand("resume")]
         | Annotated[Report, subcommand("report")]

@@ -60,6 +60,8 @@ class Grid:
     waiting: list[Task]
     batch: int
     running: list[Task] = field(default_factory=list)
+    given_up: set[Task] = field(default_factory=set)
+    """Tasks that were told to stop while the others go on."""
     losses: dict[Path, tuple[int, int]] = field(default_factory=dict)
     """Run folder -> workers lost since its newest checkpoint, and that one's step."""
     stopping: bool = False
@@ -104,6 +106,17 @@ class Grid:
         self.stopping = True
         self.running = [task for task in self.running if self.pool.stop(task)]
 
+    def give_up(self, runs: Sequence[RunStatus]) -> None:
+        """Let some runs go no further, while the others do; a run group ends only as a whole."""
+        tasks = [task for task in (*self.waiting, *self.running) if all(run in runs for run in task.runs)]
+        for task in [task for task in tasks if task not in self.given_up]:
+            self.given_up.add(task)
+            if task in self.running and self.pool.stop(task):
+                continue
+            (self.running if task in self.running else self.waiting).remove(task)
+            for run in task.runs:
+                run.status = run.status if run.status == "finished" else "interrupted"
+
     def listen(self) -> None:
         """Take in what the workers say, and how they end."""
         if not self.running:
@@ -123,23 +136,29 @@ class Grid:
         if end.code is None:
             self._lost(task, end.words)
             return
-        replaced = self.pool.replaces_lost and not self.stopping
+        stopping = self._stopping(task)
+        replaced = self.pool.replaces_lost and not stopping
         if replaced and end.code == -signal.SIGKILL:
             self._lost(task, how_it_ended(end.code, end.words))
             return
-        task.ended(end.code, self.stopping, end.words)
+        task.ended(end.code, stopping, end.words)
         self.waiting[:0] = make_tasks(task.runs, self.batch)  # those of which another process was faster
         if replaced and any(run.status in ("running", "interrupted") for run in task.runs):
             self._lost(task, "told to stop")
 
+    def _stopping(self, task: Task) -> bool:
+        """Whether a task was told to stop."""
+        return self.stopping or task in self.given_up
+
     def _lost(self, task: Task, why: str) -> None:
         """Let the runs that have not ended wait for another worker."""
+        stopping = self._stopping(task)
         for run in task.runs:
             if run.cell.finished:
                 run.status, run.fraction = "finished", 1.0
-            elif run.status == "running" and self.stopping:
+            elif run.status == "running" and stopping:
                 run.status = "interrupted"
-            elif run.status != "failed" and not self.stopping:
+            elif run.status != "failed" and not stopping:
                 self._wait_again(run, why)
         self.waiting[:0] = make_tasks(task.runs, self.batch)
 

@@ -26,6 +26,8 @@ class RunStatus:
     fraction: float = 0.0
     updates: int = 0
     episodes: int = 0
+    evaluations: int = 0
+    """How many it has told of."""
     evaluation_return: float | None = None
     message: str = ""
     """Why it failed."""
@@ -50,8 +52,8 @@ class RunStatus:
             case {"event": "progress", "fraction": float(fraction), "updates": int(updates), "episodes": int(episodes)}:
                 self.fraction, self.updates, self.episodes = fraction, updates, episodes
                 self.meter.enter(time.monotonic(), fraction, updates)
-            case {"event": "evaluated", "mean_return": float(mean)}:
-                self.evaluation_return = mean
+            case {"event": "evaluated", "evaluation": int(number), "mean_return": float(mean)}:
+                self.evaluations, self.evaluation_return = number, mean
             case {"event": "warned" | "stalled", "message": str(text)}:
                 self.warnings.append(text)
             case {"event": "finished"}:

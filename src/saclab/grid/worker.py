@@ -115,7 +115,8 @@ def messages(event: Event) -> Iterator[dict[str, object]]:
         case Progress():
             yield {"event": "progress", **event._asdict()}
         case Evaluated():
-            yield {"event": "evaluated", "mean_return": float(event.total_rewards.mean()), "updates": event.updates}
+            mean_return = float(event.total_rewards.mean())
+            yield {"event": "evaluated", "evaluation": event.evaluation, "mean_return": mean_return}
         case Finished():
             yield {"event": "finished", "reason": event.reason}
         case Failed(message=message):

@@ -1,0 +1,206 @@
+"""Whole tunes, with real runs in real workers: what they leave, that they go on, what they give up."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import saclab
+from saclab.tuning.plan import make_plan
+from saclab.tuning.study import (
+    best_trial,
+    drawn_settings,
+    is_complete,
+    mend_end,
+    open_study,
+    trials_under_way,
+)
+
+SETTINGS = {
+    "hidden_layers": (8,), "random_steps": 100, "max_updates": 60, "update_interval": 1,
+    "evaluation_interval_steps": 40, "evaluation_episodes": 1,
+}  # fmt: skip
+SPACE = {"defaults": False, "batch_size": [16, 64], "critic_learning_rate": {"low": 1e-4, "high": 1e-2, "log": True}}
+
+
+def plan_of(objective="mean", score=None, pruning=True, seeds=1):
+    return make_plan("Pendulum-v1", "sac-auto", "quick", seeds, objective, score, SPACE, SETTINGS, {}, 0, pruning)
+
+
+def tune(folder: Path, trials: int, **how) -> saclab.Tuned:
+    return saclab.tune("Pendulum-v1", "sac-auto", "quick", trials, space=SPACE, out=folder, **{**SETTINGS, **how})
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tune")
+    return folder, tune(folder, 3, seeds=2, pruning=False)
+
+
+def test_a_tune_tries_the_variants_own_settings_first_and_finds_the_best(tuned):
+    folder, result = tuned
+    study = open_study(folder, plan_of(seeds=2, pruning=False))
+    values = [trial.value for trial in study.trials]
+    assert result.trials == len(values) == 3
+    assert study.trials[0].params == {"batch_size": 64, "critic_learning_rate": 1e-3}, "of sac-auto under quick"
+    assert result.own_value == values[0]
+    assert result.value == max(values)
+    assert result.best == study.trials[values.index(max(values))].params
+
+
+def test_a_trials_value_is_the_mean_of_its_runs(tuned):
+    folder, _ = tuned
+    study = open_study(folder, plan_of(seeds=2, pruning=False))
+    for trial in study.trials:
+        folders = sorted(folder.glob(f"runs/Pendulum-v1/trial-{trial.number:04d}/quick/seed-*"))
+        runs = [saclab.read_run(run) for run in folders]
+        assert [run.config.seed for run in runs] == [0, 1]
+        assert all(run.config.algorithm.batch_size == trial.params["batch_size"] for run in runs)
+        means = [run.evaluations["mean_return"].mean() for run in runs]
+        assert trial.value == pytest.approx(sum(means) / 2)
+        assert not list(folder.glob(f"runs/*/trial-{trial.number:04d}/*/*/checkpoints")), "large, and of no more use"
+
+
+def test_the_page_shows_the_search_and_needs_nothing_else(tuned):
+    folder, result = tuned
+    page = (folder / "index.html").read_text()
+    assert result.page == folder / "index.html"
+    assert page.count("data:image/png;base64,") >= 3
+    assert "http://" not in page
+    assert "https://" not in page
+    for command in result.commands:
+        assert command.split()[1] in ("compare", "report")
+    assert f"--critic-learning-rate {result.best['critic_learning_rate']}" in result.commands[1]
+
+
+def test_the_same_call_trains_nothing_anew_and_more_trials_go_on(tuned):
+    folder, result = tuned
+    began = time.monotonic()
+    assert tune(folder, 3, seeds=2, pruning=False)._replace(page=None) == result._replace(page=None)
+    assert time.monotonic() - began < 20
+
+
+def test_a_folder_with_another_tune_is_refused(tuned):
+    folder, _ = tuned
+    with pytest.raises(saclab.UserError, match="holds a tune with another objective"):
+        tune(folder, 3, seeds=2, pruning=False, objective="final")
+    with pytest.raises(saclab.UserError, match="holds a tune with another overrides"):
+        tune(folder, 3, seeds=2, pruning=False, max_updates=70)
+
+
+def test_what_cannot_work_is_refused_before_anything_is_made(tmp_path):
+    with pytest.raises(saclab.UserError, match="score = None: objective steps needs one"):
+        tune(tmp_path / "tune", 1, objective="steps")
+    with pytest.raises(saclab.UserError, match="trials = 0"):
+        tune(tmp_path / "tune", 0)
+    assert not (tmp_path / "tune").exists()
+
+
+def test_without_optuna_the_command_says_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(saclab.UserError, match=r"saclab tune needs the package optuna: pip install 'saclab\[tune\]'"):
+        tune(tmp_path / "tune", 1)
+
+
+def test_a_run_at_its_score_ends_and_a_trial_that_is_slower_is_given_up(tmp_path):
+    """Every evaluation of Pendulum-v1 is above −2000: each run is at its score at once."""
+    result = tune(tmp_path, 3, objective="steps", score=-2000.0)
+    assert result.value == 40, "the first evaluation, of the policy as it starts"
+    folders = sorted(tmp_path.glob("runs/Pendulum-v1/*/quick/seed-0"))
+    assert len(folders) == 3
+    never = tune(tmp_path / "never", 2, objective="steps", score=0.0)
+    assert never.own_value == 2 * 160, "PAR2 of a run of 160 steps"
+
+
+def test_a_torn_last_line_of_the_journal_is_cut_off(tmp_path):
+    journal = tmp_path / "trials.jsonl"
+    plan = plan_of()
+    open_study(tmp_path, plan)
+    whole = journal.read_bytes()
+    journal.write_bytes(whole + b'{"op_code": 4, "wor')
+    study = open_study(tmp_path, plan)
+    assert study.ask().number == 0
+    assert all(json.loads(line) for line in journal.read_text().splitlines())
+    mend_end(tmp_path / "not-there")
+
+
+def test_no_settings_of_a_trial_depend_on_when_they_are_drawn(tmp_path):
+    """A new process draws what the one before it would have: the trial's number and the values before it decide."""
+    plan, drawn = plan_of(), {}
+    for folder, anew in (tmp_path / "one", False), (tmp_path / "two", True):
+        folder.mkdir()
+        study = open_study(folder, plan)
+        drawn[folder.name] = []
+        for number in range(24):
+            trial = study.ask()
+            if anew and number % 3 == 1:  # killed after the first setting was drawn
+                first = dataclasses.replace(plan, space={"batch_size": plan.space["batch_size"]})
+                drawn_settings(study, first, trial)
+                study = open_study(folder, plan)
+                (trial,) = trials_under_way(study)
+            settings = drawn_settings(study, plan, trial)
+            drawn[folder.name].append(settings)
+            study.tell(trial.number, -abs(settings["critic_learning_rate"] - 3e-3))
+    assert drawn["one"] == drawn["two"]
+    assert len({str(settings) for settings in drawn["one"]}) == 24
+
+
+@pytest.mark.slow
+def test_a_killed_tune_goes_on_as_if_nothing_had_happened(tmp_path):
+    """One worker: trials, values and runs after six `kill -9` equal those of a tune that was left alone."""
+    words = [
+        "tune", "Pendulum-v1", "--protocol", "quick", "--trials", "6", "--workers", "1", "--seeds", "2",
+        "--hidden-layers", "8", "--random-steps", "100", "--max-updates", "1500", "--evaluation-interval-steps", "200",
+        "--evaluation-episodes", "1", "--checkpoint-minutes", "0.01", "--space", str(tmp_path / "space.toml"),
+    ]  # fmt: skip
+    (tmp_path / "space.toml").write_text("defaults = false\nbatch_size = [16, 64]\ndiscount = [0.9, 0.99]\n")
+
+    def start(folder: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "saclab", *words, "--out", str(tmp_path / folder)]
+        return subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL)
+
+    assert start("straight").wait() == 0
+    for seconds in (4, 6, 9, 5, 12, 7):
+        process = start("killed")
+        time.sleep(seconds)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    assert start("killed").wait() == 0
+    trials = {}
+    for folder in ("straight", "killed"):
+        plan = make_plan_of(tmp_path / folder)
+        trials[folder] = [
+            (trial.number, trial.params, trial.value, trial.state.name)
+            for trial in open_study(tmp_path / folder, plan).trials
+        ]
+    assert trials["straight"] == trials["killed"]
+    for run in sorted((tmp_path / "straight").glob("runs/*/*/*/seed-*")):
+        other = tmp_path / "killed" / run.relative_to(tmp_path / "straight")
+        mine, theirs = saclab.read_run(run).evaluations, saclab.read_run(other).evaluations
+        if not (run / "result.json").exists():
+            continue  # given up: at which of its steps is a matter of time
+        assert mine["returns"].tolist() == theirs["returns"].tolist()
+
+
+def make_plan_of(folder: Path):
+    """The plan that the command above makes."""
+    settings = {
+        "hidden_layers": (8,), "random_steps": 100, "max_updates": 1500, "evaluation_interval_steps": 200,
+        "evaluation_episodes": 1,
+    }  # fmt: skip
+    space = {"defaults": False, "batch_size": [16, 64], "discount": [0.9, 0.99]}
+    return make_plan("Pendulum-v1", "sac-auto", "quick", 2, "mean", None, space, settings, {}, 0, True)
+
+
+def test_the_best_of_no_trials_is_none(tmp_path):
+    study = open_study(tmp_path, plan_of())
+    assert best_trial(study) is None
+    assert not any(map(is_complete, study.trials))

@@ -208,6 +208,8 @@ def test_paths_of_this_machine_are_not_published(
     assert told.status == 2
     assert f"{named} = " in told.errors
     assert "user/paths" not in workplace.hub.repositories
+    allowed = workplace.run("share", run, "user/paths", "--episodes", "1", "--paths-too")
+    assert ("evaluating" in told.output, "evaluating" in allowed.output) == (False, True)
 
 
 LOADED = """

@@ -230,7 +230,7 @@ gymnasium.register("Breaking-v0", Breaking)
     assert (run_folder(tmp_path) / "result.json").exists()
 
 
-@pytest.mark.parametrize("command", ["resume", "evaluate", "record"])
+@pytest.mark.parametrize("command", ["resume", "evaluate", "record", "play"])
 def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, tmp_path: Path, command: str) -> None:
     run = tmp_path / "received"
     shutil.copytree(run_folder(trained), run)
@@ -272,6 +272,8 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
         (("compare", "Pendulum-v1", "--seeds", "0"), "seeds = 0"),
         (("evaluate", "nowhere", "--seed", "-1"), "seed = -1"),
         (("record", "nowhere", "--seed", "-1"), "seed = -1"),
+        (("play", "nowhere"), "there is no folder "),
+        (("play", "nowhere", "--episodes", "0"), "episodes = 0"),
         (("train", "Pendulum-v1", "--name", "x" * 300), "use at most 200 letters"),
         (("resume", "x" * 300), "File name too long"),
         (("report", "x" * 300), "File name too long"),

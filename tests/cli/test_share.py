@@ -248,7 +248,7 @@ def foreign(hub: Hub, name: str, folder: Path, environment: str, wrappers: tuple
     hub.make(name, {path.name: path.read_bytes() for path in folder.iterdir()})
 
 
-@pytest.mark.parametrize("command", ["evaluate", "record"])
+@pytest.mark.parametrize("command", ["evaluate", "record", "play"])
 @pytest.mark.parametrize(
     ("environment", "wrappers"), [("evil_module:Env-v0", ()), ("Pendulum-v1", ("evil_module:wrapper",))]
 )

@@ -33,7 +33,7 @@ def test_the_page_runs_the_exported_policy(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_pages_commands_are_commands(command: str) -> None:
-    assert len(COMMANDS) == 7
+    assert len(COMMANDS) == 8
     parse(command.split()[1:])
 
 

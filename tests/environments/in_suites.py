@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from resume.helpers import assert_same_run, finish, lines_of, small_config, stop_at
+from resume.helpers import assert_same_run, finish, small_config, stop_at
 
 from saclab.environments.make import make_environment
 from saclab.environments.simulator import capture_state, restore_state
@@ -28,9 +28,12 @@ def go_on(environment, actions) -> list[np.ndarray]:
     return [*rows, observation]
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_an_episode_of_the_suite_goes_on_bit_for_bit_in_a_fresh_instance(task):
-    name = f"shimmy:dm_control/{task}-v0"
+FETCH = ("FetchReach-v4", "FetchPush-v4", "FetchSlide-v4", "FetchPickAndPlace-v4", "FetchReachDense-v4")
+NAMES = [f"shimmy:dm_control/{task}-v0" for task in TASKS] + [f"gymnasium_robotics:{task}" for task in FETCH]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_episode_goes_on_bit_for_bit_in_a_fresh_instance(name):
     first = make_environment(name, wrappers=FLAT)
     first.reset(seed=1)
     first.action_space.seed(2)
@@ -48,9 +51,16 @@ def test_an_episode_of_the_suite_goes_on_bit_for_bit_in_a_fresh_instance(task):
         np.testing.assert_array_equal(ours, theirs, err_msg=f"step {step + 1} after the restore")
 
 
-@pytest.mark.parametrize("task", ["reach_site_features", "lqr-lqr_2_1"])
-def test_what_keeps_more_is_not_captured(task):
-    environment = make_environment(f"shimmy:dm_control/{task}-v0", wrappers=FLAT)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "shimmy:dm_control/reach_site_features-v0",
+        "shimmy:dm_control/lqr-lqr_2_1-v0",
+        "gymnasium_robotics:HandReach-v3",
+    ],
+)
+def test_what_keeps_more_is_not_captured(name):
+    environment = make_environment(name, wrappers=FLAT)
     environment.reset(seed=0)
     assert capture_state(environment) is None
 
@@ -64,10 +74,10 @@ def test_a_run_on_the_suite_continues_exactly_and_its_policy_is_evaluated(tmp_pa
     assert evaluate(tmp_path / "straight", 1, 0, imports=["shimmy"]).lengths == [1000]
 
 
-def test_a_run_on_fetch_trains_and_says_that_its_episodes_begin_anew(tmp_path):
-    config = small_config("gymnasium_robotics:FetchReach-v4", wrappers=FLAT)
-    stop_at(90, config, tmp_path)
-    finish(config, tmp_path)
-    (note,) = lines_of(tmp_path / "sessions.jsonl")[1]["notes"]
-    assert "cannot be captured" in note
-    assert evaluate(tmp_path, 1, 0, imports=["gymnasium_robotics"]).lengths == [50]
+def test_a_run_on_fetch_continues_exactly(tmp_path):
+    config = small_config("gymnasium_robotics:FetchPush-v4", environments=3, wrappers=FLAT)
+    finish(config, tmp_path / "straight")
+    stop_at(90, config, tmp_path / "stopped")
+    finish(config, tmp_path / "stopped")
+    assert_same_run(tmp_path / "straight", tmp_path / "stopped")
+    assert evaluate(tmp_path / "straight", 1, 0, imports=["gymnasium_robotics"]).lengths == [50]

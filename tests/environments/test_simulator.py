@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import gymnasium
 import numpy as np
 import pytest
@@ -83,3 +85,24 @@ def test_an_environment_may_bring_its_own_capture():
     state = capture_state(environment)
     assert state["physics"]["counters"].tolist() == [1, 1]
     assert state["elapsed_steps"] == [1]
+
+
+@pytest.mark.parametrize("kind", [np.random.PCG64DXSM, np.random.MT19937, np.random.Philox, np.random.SFC64])
+def test_whatever_its_generator_an_episode_goes_on_by_way_of_json(kind):
+    """Some kinds have arrays in their state."""
+    first, fresh = make_environment("Pendulum-v1"), make_environment("Pendulum-v1")
+    for environment in (first, fresh):
+        environment.reset(seed=0)
+        environment.unwrapped.np_random = np.random.Generator(kind(5 if environment is first else 6))
+    first.unwrapped.np_random.standard_normal(7)
+    state = capture_state(first)
+    restore_state(fresh, state | {"generator": json.loads(json.dumps(state["generator"]))})
+    np.testing.assert_array_equal(first.reset()[0], fresh.reset()[0])
+
+
+def test_a_generator_of_another_kind_is_refused():
+    first, fresh = make_environment("Pendulum-v1"), make_environment("Pendulum-v1")
+    first.reset(seed=0), fresh.reset(seed=0)
+    fresh.unwrapped.np_random = np.random.Generator(np.random.Philox(1))
+    with pytest.raises(ValueError, match="state must be for a Philox"):
+        restore_state(fresh, capture_state(first))

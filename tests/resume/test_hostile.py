@@ -119,6 +119,9 @@ def test_a_file_larger_than_memory_is_not_read(stage, folder):
 WRONG_ARRAYS = {
     "learner of another type": ("learner.safetensors", {".temperature.weights": np.zeros((), np.float64)}),
     "learner of another shape": ("learner.safetensors", {".actor.weights": np.zeros(3, np.float32)}),
+    "moments of another shape": ("learner.safetensors", {".actor.moments.mu": np.zeros(3, np.float32)}),
+    "moments that are not finite": ("learner.safetensors", {".temperature.moments.nu": np.array(np.nan, np.float32)}),
+    "a learner that is not finite": ("learner.safetensors", {".temperature.weights": np.array(np.inf, np.float32)}),
     "learner with a part missing": ("learner.safetensors", {".key": None}),
     "window of another width": ("window.safetensors", {"metrics": np.zeros((2, 3), np.float32)}),
     "window of another type": ("window.safetensors", {"metrics": np.zeros((2, 9), np.float64)}),

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from saclab.cli.results import Evaluate, Export, Protocols, Record, Report, Share, Variants, Watch
+from saclab.cli.results import Evaluate, Export, Play, Protocols, Record, Report, Share, Variants, Watch
 from saclab.cli.settings import with_absolute_paths, with_settings
 from saclab.cli.streams import output_lost, use_lasting_streams
 from saclab.cli.training import Compare, Reproduce, Resume, Train
@@ -64,6 +64,7 @@ def parse(arguments: Sequence[str]) -> Any:
         | Annotated[Watch, subcommand("watch")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Record, subcommand("record")]
+        | Annotated[Play, subcommand("play")]
         | Annotated[Export, subcommand("export")]
         | Annotated[Share, subcommand("share")]
         | Annotated[Variants, subcommand("variants")]

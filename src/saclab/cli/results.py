@@ -6,6 +6,7 @@ Nothing slow is imported before a command runs, so that `saclab --help` answers 
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,6 +82,34 @@ def beside(run: Path, ending: str) -> Path | None:
     from saclab import hub
 
     return Path(f"{hub.parsed(run).repository.partition('/')[2]}.{ending}") if hub.is_address(run) else None
+
+
+@dataclass(frozen=True)
+class Play:
+    """Show a run's best policy in a window, episode after episode, until it is closed or Ctrl-C."""
+
+    run: Positional[Path]
+    """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
+    episodes: int | None = None
+    """How many episodes; None for no end."""
+    seed: int = 1_000_000
+    """Seed of the episodes' starts, which are those of `evaluate`."""
+    stochastic: bool = False
+    """Sample actions in place of the mean action."""
+    imports: tuple[str, ...] = ()
+    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
+
+    def __call__(self, console: Console) -> int:
+        from saclab.play import play
+
+        if self.episodes is not None and self.episodes < 1:
+            raise SettingError("episodes", self.episodes, "use at least 1")
+        with suppress(KeyboardInterrupt):  # the way to end it
+            played = play(self.run, self.episodes, self.seed, not self.stochastic, self.imports)
+            for number, episode in enumerate(played, start=1):
+                told = f"episode {number}: return {episode.total_reward:.1f} in {episode.length} steps"
+                console.print(told, soft_wrap=True, highlight=False)
+        return 0
 
 
 @dataclass(frozen=True)

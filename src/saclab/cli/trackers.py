@@ -1,16 +1,31 @@
-"""Experiment trackers: they read a run's events and nothing else. Both are optional extras."""
+"""Experiment trackers: they read a run's events and nothing else. Each is an optional extra."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any, Protocol
 
-from saclab.config import Config
+from saclab.config import Config, flatten
+from saclab.errors import TrainingFailed, UserError, in_words
 from saclab.extras import required
+from saclab.files import replace_file
 from saclab.training import events
 
-Log = Callable[[Mapping[str, float], int], None]
-"""(name -> value, environment step) -> None."""
+
+class Tracker(Protocol):
+    """What takes a run's numbers."""
+
+    def open(self, started: events.Started) -> None:
+        """Begin with a run, or go on with a resumed one."""
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Take numbers by name, of an environment step."""
+
+    def close(self, finished: bool) -> None:
+        """Nothing comes any more: the run is at its end, or was stopped and may go on."""
 
 
 def scalars(event: events.Event) -> tuple[dict[str, float], int] | None:
@@ -28,56 +43,172 @@ def scalars(event: events.Event) -> tuple[dict[str, float], int] | None:
     return None
 
 
-def track(
-    stream: Iterable[events.Event], start: Callable[[events.Started], tuple[Log, Callable[[], None]]]
-) -> Iterator[events.Event]:
-    """Pass a run's events on, and send their numbers to a tracker that `start` opens: its log and its close."""
-    log: Log | None = None
-    close: Callable[[], None] | None = None
+def track(stream: Iterable[events.Event], tracker: Tracker) -> Iterator[events.Event]:
+    """Pass a run's events on, and send their numbers to a tracker.
+
+    A tracker that breaks is told of and gets nothing more: the run is worth more than its curves elsewhere.
+
+    Raises:
+        UserError: if it cannot be opened.
+        TrainingFailed: if it cannot be closed.
+    """
+    kind, tracking, finished = type(tracker).__name__, False, False
     try:
         for event in stream:
             if isinstance(event, events.Started):
-                log, close = start(event)
-            elif log is not None and (found := scalars(event)) is not None:
-                log(*found)
+                open_tracker(tracker, event)
+                tracking = True
+            elif tracking and (found := scalars(event)) is not None:
+                try:
+                    tracker.log(*found)
+                except Exception as error:
+                    tracking = False
+                    yield events.Warned(f"{kind} gets nothing more, and the run goes on: {in_words(error)}")
+            finished = finished or isinstance(event, events.Finished)
             yield event
     finally:
-        if close is not None:
-            close()
+        if tracking:
+            close_tracker(tracker, finished)
 
 
-def tensorboard(stream: Iterable[events.Event]) -> Iterator[events.Event]:
-    """Write event files into the run folder's `tensorboard`; a resumed run takes back what it had logged too far.
+def open_tracker(tracker: Tracker, started: events.Started) -> None:
+    try:
+        tracker.open(started)
+    except Exception as error:
+        raise UserError(f"{type(tracker).__name__} cannot be used: {in_words(error)}") from error
 
-    Raises:
-        UserError: if the extra is not installed.
+
+def close_tracker(tracker: Tracker, finished: bool) -> None:
+    try:
+        tracker.close(finished)
+    except Exception as error:
+        said = f"{type(tracker).__name__} did not get the run's last numbers: {in_words(error)}"
+        raise TrainingFailed(f"{said}; what was saved is kept") from error
+
+
+def name_of(folder: Path) -> str:
+    """A run's name in a tracker: environment, variant, protocol and seed, as in its path."""
+    return "-".join(folder.parts[-4:])
+
+
+class TensorBoard:
+    """Event files in the run folder's `tensorboard`; a resumed run takes back what it had logged too far."""
+
+    def __init__(self) -> None:
+        """Raises UserError if the extra is not installed."""
+        self.writer_type: Any = required("tensorboardX", "tensorboard", "--tensorboard").SummaryWriter
+
+    def open(self, started: events.Started) -> None:
+        self.writer = self.writer_type(str(started.run / "tensorboard"), purge_step=started.resumed_at_step + 1)
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        for name, value in values.items():
+            self.writer.add_scalar(name, value, step)
+
+    def close(self, finished: bool) -> None:
+        self.writer.close()
+
+
+class WeightsAndBiases:
+    """A run at Weights & Biases, under an id made of the run folder, so that a resumed run goes on there."""
+
+    def __init__(self, project: str, config: Config, folder: Path) -> None:
+        """Raises UserError if the extra is not installed."""
+        self.project, self.config, self.folder = project, config, folder
+        self.module: Any = required("wandb", "wandb", "--wandb")
+
+    def open(self, started: events.Started) -> None:
+        name = name_of(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.run = self.module.init(
+            project=self.project, name=name, id=name, resume="allow", config=self.config.to_dict(), dir=str(self.folder)
+        )
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        self.run.log(dict(values), step=step)
+
+    def close(self, finished: bool) -> None:
+        self.run.finish()
+
+
+class MLflow:
+    """A run of an MLflow experiment; its id lies in the run folder, so that a resumed run goes on there.
+
+    Nothing can be taken back from MLflow, and a second value of a step would stand beside the first one. So a resumed
+    run logs nothing of a step that MLflow has already: it goes on bit for bit, and the numbers are the same.
     """
-    writer_type = required("tensorboardX", "tensorboard", "--tensorboard").SummaryWriter
 
-    def start(event: events.Started) -> tuple[Log, Callable[[], None]]:
-        writer = writer_type(str(event.run / "tensorboard"), purge_step=event.resumed_at_step + 1)
+    HOLD_SECONDS = 2.0
+    """Numbers are sent together: a request takes as long as several steps."""
 
-        def log(values: Mapping[str, float], step: int) -> None:
-            for name, value in values.items():
-                writer.add_scalar(name, value, step)
+    def __init__(self, experiment: str, config: Config) -> None:
+        """Make the experiment if there is none.
 
-        return log, writer.close
+        Raises:
+            UserError: if the extra is not installed, or MLflow cannot be reached or used.
+        """
+        self.mlflow: Any = required("mlflow", "mlflow", "--mlflow")
+        self.config = config
+        try:
+            self.experiment = self.mlflow.set_experiment(experiment).experiment_id
+            self.client = self.mlflow.MlflowClient()
+        except Exception as error:
+            place = self.mlflow.get_tracking_uri()
+            raise UserError(
+                f"--mlflow {experiment}: {place} cannot be used: {in_words(error)}; the environment variable "
+                "MLFLOW_TRACKING_URI names a server or a database"
+            ) from error
+        self.held: list[Any] = []
+        self.sent_at = time.monotonic()
 
-    return track(stream, start)
+    def open(self, started: events.Started) -> None:
+        known = started.run / "mlflow.txt"
+        self.run = self._found(known) or self._made(name_of(started.run))
+        replace_file(known, f"{self.run}\n".encode())
+        self.client.update_run(self.run, status="RUNNING")
+        self.logged = {
+            name: max(metric.step for metric in self.client.get_metric_history(self.run, name))
+            for name in self.client.get_run(self.run).data.metrics
+        }
 
+    def _found(self, known: Path) -> str | None:
+        """The run whose id a file holds, if MLflow has it."""
+        run = known.read_text(errors="replace").strip() if known.exists() else ""
+        if not re.fullmatch("[0-9a-f]{32}", run):
+            return None
+        try:
+            found = self.client.get_run(run)
+        except self.mlflow.MlflowException as error:
+            if error.error_code == "RESOURCE_DOES_NOT_EXIST":
+                return None
+            raise
+        here = found.info.experiment_id == self.experiment and found.info.lifecycle_stage == "active"
+        return run if here else None
 
-def wandb(stream: Iterable[events.Event], project: str, config: Config, folder: Path) -> Iterator[events.Event]:
-    """Send a run to Weights & Biases, under an id made of its folder, so that a resumed run goes on there.
+    def _made(self, name: str) -> str:
+        """A new run with the settings as its parameters."""
+        run: str = self.client.create_run(self.experiment, run_name=name).info.run_id
+        settings = flatten(self.config.to_dict())
+        parameters = [self.mlflow.entities.Param(key, str(value)) for key, value in settings.items()]
+        for start in range(0, len(parameters), 100):  # MLflow takes no more at once
+            self.client.log_batch(run, params=parameters[start : start + 100])
+        return run
 
-    Raises:
-        UserError: if the extra is not installed.
-    """
-    module = required("wandb", "wandb", "--wandb")
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        now = int(1000 * time.time())
+        self.held += [
+            self.mlflow.entities.Metric(name, value, now, step)
+            for name, value in values.items()
+            if step > self.logged.get(name, -1)
+        ]
+        if time.monotonic() - self.sent_at > self.HOLD_SECONDS:
+            self._send()
 
-    def start(event: events.Started) -> tuple[Log, Callable[[], None]]:
-        name = "-".join(folder.parts[-4:])
-        folder.mkdir(parents=True, exist_ok=True)
-        run = module.init(project=project, name=name, id=name, resume="allow", config=config.to_dict(), dir=str(folder))
-        return (lambda values, step: run.log(dict(values), step=step)), run.finish
+    def _send(self) -> None:
+        for start in range(0, len(self.held), 1000):  # MLflow takes no more at once
+            self.client.log_batch(self.run, metrics=self.held[start : start + 1000])
+        self.held, self.sent_at = [], time.monotonic()
 
-    return track(stream, start)
+    def close(self, finished: bool) -> None:
+        self._send()
+        self.client.set_terminated(self.run, "FINISHED" if finished else "KILLED")

@@ -23,6 +23,7 @@ from saclab.variants import COMPARED
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from saclab.cli.trackers import Tracker
     from saclab.training.events import Event
 
 Given = Mapping[str, Any]
@@ -37,6 +38,30 @@ class Where:
     """Wall-clock time between checkpoints; it does not change any result."""
     environment_arguments: str = "{}"
     """Keyword arguments of the environment, as JSON: '{"reset_noise_scale": 0.0}'."""
+
+
+@dataclass(frozen=True)
+class Tracking:
+    tensorboard: bool = False
+    """Write TensorBoard event files into the run folder; needs the extra `tensorboard`."""
+    wandb: str | None = None
+    """Send the run to this project of Weights & Biases; needs the extra `wandb`."""
+    mlflow: str | None = None
+    """Send the run to this experiment of MLflow, at MLFLOW_TRACKING_URI, or else in ./mlflow.db; needs the extra
+    `mlflow`."""
+
+    def trackers(self, config: Config, folder: Path) -> list[Tracker]:
+        """Those that were asked for, of a run; raises UserError if an extra is not installed."""
+        from saclab.cli import trackers
+
+        chosen: list[Tracker] = []
+        if self.tensorboard:
+            chosen.append(trackers.TensorBoard())
+        if self.wandb is not None:
+            chosen.append(trackers.WeightsAndBiases(self.wandb, config, folder))
+        if self.mlflow is not None:
+            chosen.append(trackers.MLflow(self.mlflow, config))
+        return chosen
 
 
 @dataclass(frozen=True)
@@ -58,10 +83,7 @@ class Train:
     of this name."""
     threads: int | None = None
     """Cores that XLA uses; None for all. Results depend on it in the last bits."""
-    tensorboard: bool = False
-    """Write TensorBoard event files into the run folder; needs the extra `tensorboard`."""
-    wandb: str | None = None
-    """Send the run to this project of Weights & Biases; needs the extra `wandb`."""
+    tracking: OmitArgPrefixes[Tracking] = field(default_factory=Tracking)
     where: OmitArgPrefixes[Where] = field(default_factory=Where)
 
     def __call__(self, console: Console) -> int:
@@ -73,7 +95,7 @@ class Train:
             parse_arguments(self.where.environment_arguments), {**self.algorithm, **self.training},
         )  # fmt: skip
         folder = run_path(self.where.runs, config, self.name)
-        return train_and_show(config, folder, self.where.checkpoint_minutes, console, self.tensorboard, self.wandb)
+        return train_and_show(config, folder, self.where.checkpoint_minutes, console, self.tracking)
 
 
 @dataclass(frozen=True)
@@ -88,6 +110,7 @@ class Resume:
     """Cores that XLA uses; None for as many as the run has used so far."""
     imports: tuple[str, ...] = ()
     """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
+    tracking: OmitArgPrefixes[Tracking] = field(default_factory=Tracking)
 
     def __call__(self, console: Console) -> int:
         from saclab.training.run_folder import read_config, read_last_session
@@ -97,7 +120,7 @@ class Resume:
         from saclab.environments.wrappers import require_import_allowed
 
         require_import_allowed(config.environment, config.training.wrappers, self.imports)
-        return train_and_show(config, self.run, self.checkpoint_minutes, console)
+        return train_and_show(config, self.run, self.checkpoint_minutes, console, self.tracking)
 
 
 @dataclass(frozen=True)
@@ -226,27 +249,22 @@ def limit_threads(threads: int | None) -> None:
 
 
 def train_and_show(
-    config: Config,
-    folder: Path,
-    checkpoint_minutes: float,
-    console: Console,
-    tensorboard: bool = False,
-    wandb_project: str | None = None,
+    config: Config, folder: Path, checkpoint_minutes: float, console: Console, tracking: Tracking
 ) -> int:
     """Train in this process with a progress bar."""
-    from saclab.cli import display, trackers
+    from saclab.cli import display
+    from saclab.cli.trackers import track
     from saclab.signals import EXIT_STATUS, requests_from_signals
     from saclab.training.loop import train
     from saclab.training.run_folder import is_finished
 
-    if is_finished(folder):
+    finished = is_finished(folder)
+    if finished:
         console.print(f"{folder} is finished already; its results are kept", soft_wrap=True, markup=False)
     with requests_from_signals(process_ends=True) as requests:
         stream: Iterable[Event] = train(config, folder, requests, checkpoint_minutes)
-        if tensorboard:
-            stream = trackers.tensorboard(stream)
-        if wandb_project is not None:
-            stream = trackers.wandb(stream, wandb_project, config, folder)
+        for tracker in [] if finished else tracking.trackers(config, folder):
+            stream = track(stream, tracker)
         for _ in display.show_run(stream, console):
             pass
         if requests.stop:

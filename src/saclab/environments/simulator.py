@@ -9,7 +9,8 @@ nothing changes within an episode may say so: `saclab_stateless = True` in the c
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias, TypeGuard
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -29,6 +30,7 @@ from gymnasium.wrappers import (
 )
 
 from saclab.environments.dm_suite import capture_dm_suite, is_dm_suite, restore_dm_suite
+from saclab.environments.fetch import capture_fetch, is_fetch, restore_fetch
 
 Environment: TypeAlias = gymnasium.Env[Any, Any]
 State: TypeAlias = dict[str, Any]
@@ -50,13 +52,13 @@ def capture_state(environment: Environment) -> State | None:
         elif not keeps_nothing(inner):
             return None
         inner = inner.env
-    physics = capture_physics(inner)
-    if physics is None:
+    simulator = simulator_of(inner)
+    if simulator is None:
         return None
     return {
-        "physics": physics,
+        "physics": simulator.capture(inner),
         "elapsed_steps": elapsed_steps,
-        "generator": {} if is_dm_suite(inner) else inner.np_random.bit_generator.state,
+        "generator": plain(inner.np_random.bit_generator.state) if simulator.draws_from_np_random else {},
     }
 
 
@@ -79,46 +81,14 @@ def restore_state(environment: Environment, state: State) -> None:
         inner = inner.env
     for limit, elapsed_steps in zip(limits, state["elapsed_steps"], strict=True):
         limit._elapsed_steps = elapsed_steps
-    restore_physics(inner, state["physics"])
-    if not is_dm_suite(inner):
+    simulator = simulator_of(inner)
+    if simulator is None:
+        raise ValueError(f"the state of {type(inner).__name__} cannot be restored")
+    if simulator is not ITS_OWN:
+        require_same_arrays(state["physics"], simulator.capture(inner))
+    simulator.restore(inner, state["physics"])
+    if simulator.draws_from_np_random:
         inner.np_random.bit_generator.state = state["generator"]
-
-
-def capture_physics(environment: Environment) -> dict[str, np.ndarray] | None:
-    """The simulator's own state as arrays; None for a simulator that saclab does not know."""
-    if hasattr(environment, "saclab_capture"):
-        captured: dict[str, np.ndarray] = environment.saclab_capture()
-        return captured
-    if is_gymnasium_mujoco(environment):
-        return capture_mujoco(environment)
-    if is_dm_suite(environment):
-        return capture_dm_suite(environment)
-    if type(environment) in CLASSIC_CONTROL:
-        return {"state": np.array(getattr(environment, "state"))}  # noqa: B009 - mypy does not know the class
-    return None
-
-
-CLASSIC_CONTROL = (PendulumEnv, Continuous_MountainCarEnv)
-
-
-def is_gymnasium_mujoco(environment: Environment) -> TypeGuard[MujocoEnv]:
-    """Whether it is one of Gymnasium's own MuJoCo environments, which keep nothing but the simulator's state."""
-    return isinstance(environment, MujocoEnv) and type(environment).__module__.startswith("gymnasium.envs.mujoco.")
-
-
-def restore_physics(environment: Environment, physics: dict[str, np.ndarray]) -> None:
-    if hasattr(environment, "saclab_restore"):
-        environment.saclab_restore(physics)
-        return
-    for name, array in (capture_physics(environment) or {}).items():
-        if physics[name].shape != array.shape or physics[name].dtype != array.dtype:
-            raise ValueError(f"{name} is not {array.dtype}{list(array.shape)}")
-    if is_gymnasium_mujoco(environment):
-        restore_mujoco(environment, physics)
-    elif is_dm_suite(environment):
-        restore_dm_suite(environment, physics)
-    else:
-        setattr(environment, "state", physics["state"].copy())  # noqa: B010 - classic control keeps it there
 
 
 # Derived quantities that MuJoCo computes late in a step and Gymnasium's environments read before the next one.
@@ -149,3 +119,61 @@ def restore_mujoco(environment: MujocoEnv, physics: dict[str, np.ndarray]) -> No
     mujoco.mj_setState(model, data, physics["integration"], kind)
     for name in LAGGING:
         getattr(data, name)[:] = physics[name]
+
+
+def is_gymnasium_mujoco(environment: Environment) -> bool:
+    """Whether it is one of Gymnasium's own MuJoCo environments, which keep nothing but the simulator's state."""
+    return isinstance(environment, MujocoEnv) and type(environment).__module__.startswith("gymnasium.envs.mujoco.")
+
+
+def restore_classic(environment: Any, physics: dict[str, np.ndarray]) -> None:
+    environment.state = physics["state"].copy()
+
+
+class Simulator(NamedTuple):
+    """How the state of one kind of environment is captured and restored."""
+
+    knows: Callable[[Any], bool]
+    """Whether an environment, without its wrappers, is of this kind."""
+    capture: Callable[[Any], dict[str, np.ndarray]]
+    restore: Callable[[Any, dict[str, np.ndarray]], None]
+    draws_from_np_random: bool = True
+    """Whether its generator is Gymnasium's, which is captured then."""
+
+
+ITS_OWN = Simulator(
+    lambda environment: hasattr(environment, "saclab_capture"),
+    lambda environment: environment.saclab_capture(),
+    lambda environment, physics: environment.saclab_restore(physics),
+)
+SIMULATORS = (
+    ITS_OWN,
+    Simulator(is_gymnasium_mujoco, capture_mujoco, restore_mujoco),
+    Simulator(is_dm_suite, capture_dm_suite, restore_dm_suite, draws_from_np_random=False),
+    Simulator(is_fetch, capture_fetch, restore_fetch),
+    Simulator(
+        lambda environment: type(environment) in (PendulumEnv, Continuous_MountainCarEnv),
+        lambda environment: {"state": np.array(environment.state)},
+        restore_classic,
+    ),
+)
+"""The first that knows an environment is that of its kind."""
+
+
+def simulator_of(environment: Environment) -> Simulator | None:
+    """How the state of an environment without wrappers is captured; None if saclab does not know it."""
+    return next((simulator for simulator in SIMULATORS if simulator.knows(environment)), None)
+
+
+def require_same_arrays(physics: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    """Raise KeyError or ValueError unless the arrays are of the shapes and types of an environment of this kind."""
+    for name, array in expected.items():
+        if physics[name].shape != array.shape or physics[name].dtype != array.dtype:
+            raise ValueError(f"{name} is not {array.dtype}{list(array.shape)}")
+
+
+def plain(state: Any) -> Any:
+    """A generator's state as JSON has it: some kinds keep arrays, and take lists as well."""
+    if isinstance(state, dict):
+        return {name: plain(value) for name, value in state.items()}
+    return state.tolist() if isinstance(state, np.ndarray | np.generic) else state

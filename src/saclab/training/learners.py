@@ -22,6 +22,7 @@ from saclab.replay import RowLayout
 from saclab.settings import AlgorithmSettings, structure
 from saclab.training import seeds
 from saclab.training.captured import require_like
+from saclab.training.manifest import CheckpointError
 from saclab.training.process import compiled
 
 
@@ -95,14 +96,27 @@ def finite_arrays(learner: LearnerState, updates: int) -> dict[str, np.ndarray]:
     """The learner's arrays by name; raises NonFiniteError if it is not worth continuing from."""
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(learner).items()}
     for name, array in arrays.items():
-        zero_temperature = name == ".temperature.weights" and array == -np.inf
-        if not (np.isfinite(array).all() or zero_temperature):
+        if not is_finite(name, array):
             raise NonFiniteError(f"after update {updates} {name} is not finite")
     return arrays
 
 
+def is_finite(name: str, array: np.ndarray) -> bool:
+    """Whether a learner can go on with an array; the logarithm of a temperature of 0 is none that is."""
+    return bool(np.isfinite(array).all() or (name == ".temperature.weights" and array == -np.inf))
+
+
 def learner_from(arrays: Mapping[str, np.ndarray], example: LearnerState) -> LearnerState:
-    """The learner whose arrays these are by name; raises CheckpointError unless they are like the example's."""
-    checked = [require_like(name, arrays.get(name), np.asarray(leaf)) for name, leaf in named_leaves(example).items()]
-    restored: LearnerState = jax.tree.unflatten(jax.tree.structure(example), checked)
+    """The learner whose arrays these are by name.
+
+    Raises:
+        CheckpointError: unless all, Adam's moments counted in, are like the example's, and finite.
+    """
+    checked = {
+        name: require_like(name, arrays.get(name), np.asarray(leaf)) for name, leaf in named_leaves(example).items()
+    }
+    for name, array in checked.items():
+        if not is_finite(name, array):
+            raise CheckpointError(f"the checkpoint's {name} is not finite, and saclab saves none that is not")
+    restored: LearnerState = jax.tree.unflatten(jax.tree.structure(example), checked.values())
     return restored

@@ -7,7 +7,9 @@ PEERS := .venv-peers
 SUITES := .venv-suites
 WHEEL := .venv-wheel
 
-.PHONY: quickstart test test-slow peers suites wheel fuzz check lint format types benchmark clean
+LINTED := src tests benchmarks examples docs/site_hooks.py
+
+.PHONY: quickstart test test-slow peers suites wheel docs fuzz check lint format types benchmark clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
@@ -30,18 +32,21 @@ wheel: $(VENV)/installed  ## build the wheel, install it into an empty environme
 	cd $(WHEEL) && bin/saclab --version && bin/saclab compare Pendulum-v1 --variants sac sac-auto --protocol quick \
 		--max-updates 50 --random-steps 200 --batch-size 32 --evaluation-interval-steps 250 --runs runs
 
+docs: $(VENV)/installed  ## the documentation site, in site/: read site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
 fuzz: $(VENV)/installed  ## look for damage and misuse that is not told of, for as long as it takes
 	SACLAB_FUZZ=long $(BIN)/python -m pytest -m "slow or not slow" tests/fuzz
 
 check: lint types test
 
 lint: $(VENV)/installed
-	$(BIN)/ruff check src tests benchmarks examples
-	$(BIN)/ruff format --check src tests benchmarks examples
+	$(BIN)/ruff check $(LINTED)
+	$(BIN)/ruff format --check $(LINTED)
 
 format: $(VENV)/installed
-	$(BIN)/ruff check --fix src tests benchmarks examples
-	$(BIN)/ruff format src tests benchmarks examples
+	$(BIN)/ruff check --fix $(LINTED)
+	$(BIN)/ruff format $(LINTED)
 
 types: $(VENV)/installed
 	$(BIN)/mypy
@@ -49,6 +54,7 @@ types: $(VENV)/installed
 benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other libraries: leave the machine alone for half an hour
 	$(BIN)/python benchmarks/speed.py --peers $(PEERS)/bin/python
 	$(BIN)/python benchmarks/tables.py speed
+	$(BIN)/python benchmarks/tables.py peers
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/memory.py
@@ -73,4 +79,4 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(PEERS) $(SUITES) $(WHEEL) build dist src/*.egg-info
+	rm -rf $(VENV) $(PEERS) $(SUITES) $(WHEEL) build dist site src/*.egg-info

@@ -1,6 +1,7 @@
 """Make the tables of the documentation from the results.
 
-    python benchmarks/tables.py speed [--write README.md]
+    python benchmarks/tables.py speed [--write docs/speed.md]
+    python benchmarks/tables.py peers [--write README.md]
     python benchmarks/tables.py batches [--write docs/where-to-run.md]
 
 A table stands between `<!-- speed -->` and `<!-- /speed -->`, and is replaced; so for the other name.
@@ -16,6 +17,7 @@ from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
 BASE = "saclab"
+PEER_ROWS = ("Stable-Baselines3", "SBX", "Tianshou")
 PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "rltools", "mkl", "torch")
 
 
@@ -38,18 +40,40 @@ def speed_table(record: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def peers_table(record: dict[str, Any]) -> str:
+    """One row for each library: its rates in two cases, and how much faster saclab is, at least and at most."""
+    cases = [entry["rounds"] for entry in record["cases"].values()]
+    shown = ("HalfCheetah-v4, 1:5, single run", "HalfCheetah-v4, 1:5, grid")
+    lines = [
+        "| HalfCheetah-v4, an update every 5 steps | single run, updates/s | grid, updates/s "
+        f"| saclab is faster by, in {len(cases)} cases |",
+        "|---|---|---|---|",
+    ]
+    for name in (BASE, *PEER_ROWS):
+        rates = [row("", name, record["cases"][case]["rounds"])[2] for case in shown]
+        ratios = sorted(saclab_faster_by(name, rounds) for rounds in cases)
+        faster = "" if name == BASE else f"{ratios[0]:.2f} to {ratios[-1]:.2f}×"
+        lines.append(f"| {name} | {rates[0]} | {rates[1]} | {faster} |")
+    return "\n".join(lines)
+
+
+def saclab_faster_by(name: str, rounds: list[dict[str, Any]]) -> float:
+    """The median over the rounds of saclab's rate divided by that of `name` in the same round."""
+    return statistics.median(entry[BASE]["updates_per_second"] / entry[name]["updates_per_second"] for entry in rounds)
+
+
 def row(case: str, name: str, rounds: list[dict[str, Any]]) -> list[str]:
     rates = [entry[name]["updates_per_second"] for entry in rounds]
     limit = "averaged" if name.endswith("averaged") else "updates_per_second"
     share = statistics.median(entry[name]["updates_per_second"] / entry["limit"][limit] for entry in rounds)
-    ratio = statistics.median(entry[BASE]["updates_per_second"] / entry[name]["updates_per_second"] for entry in rounds)
 
     def median(key: str) -> float:
         return statistics.median(entry[name][key] for entry in rounds)
 
     return [
         case, name, f"{statistics.median(rates):.0f} ({min(rates):.0f}–{max(rates):.0f})", f"{share:.2f}",
-        "" if name == BASE else f"{ratio:.2f}×", f"{median('cpu_seconds_per_1000_updates'):.1f}",
+        "" if name == BASE else f"{saclab_faster_by(name, rounds):.2f}×",
+        f"{median('cpu_seconds_per_1000_updates'):.1f}",
         f"{median('first_update_seconds'):.1f}", f"{median('peak_bytes') / 2**20:.0f}",
     ]  # fmt: skip
 
@@ -102,13 +126,20 @@ def replace_between(text: str, name: str, table: str) -> str:
     return f"{before}{start}\n{table}\n{end}{after}"
 
 
+def made(name: str) -> str:
+    """A table by its name."""
+    if name == "batches":
+        return batches_tables()
+    record = json.loads((RESULTS / "speed.json").read_text())
+    return speed_table(record) if name == "speed" else peers_table(record)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", choices=("speed", "batches"))
+    parser.add_argument("name", choices=("speed", "peers", "batches"))
     parser.add_argument("--write", type=Path, help="the file to put the table into; printed otherwise")
     options = parser.parse_args()
-    speed = options.name == "speed"
-    table = speed_table(json.loads((RESULTS / "speed.json").read_text())) if speed else batches_tables()
+    table = made(options.name)
     if options.write is None:
         print(table)
         return

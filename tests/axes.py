@@ -8,7 +8,9 @@ AXES: dict[str, dict[str, Any]] = {
     "held noise and scaled rewards": {"longest_noise": 16, "reward_scaling": "deviation_or_bound"},
     "normalised observations": {"observation_normalisation": "running"},
     "three steps": {"n_step": 3},
-    "reward terms": {"reward_terms": ("reward_run", "reward_ctrl"), "reward_weights": (0.5, 2.0)},
+    "reward terms, one on a slope": {
+        "reward_terms": ("reward_run",), "reward_weights": (0.5,), "reward_schedule": ("reward_ctrl: 0@0.1 2@0.9",),
+    },
     "batch normalisation, joint, without a target": {
         "network": "batch_norm_mlp", "joint_forward": True, "actor_joint_forward": True, "snapshots": 0,
         "weight_projection": "unit_columns",

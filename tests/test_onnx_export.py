@@ -16,7 +16,7 @@ from saclab.cli.main import main
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.onnx_export import Graph, export_onnx
-from saclab.protocols import make_config
+from saclab.protocols import own_config
 from saclab.trained_policy import TrainedPolicy, load_policy, save_policy
 from saclab.variants import VARIANTS
 
@@ -27,7 +27,7 @@ NOISE = np.random.default_rng(2).normal(size=(40, 2)).astype(np.float32)
 
 def saved(folder: Path, low=LOW, high=HIGH, variant: str = "sac-auto", **overrides: object) -> TrainedPolicy:
     """A policy away from its start that has been saved and loaded: running statistics positive, as they are."""
-    config = make_config("Some-v0", variant, overrides=overrides)
+    config = own_config("Some-v0", variant, "standard", overrides=overrides)
     spec = EnvironmentSpec(3, 2, low, high)
     network = TrainedPolicy(config.algorithm, spec, np.zeros(0)).policy.network
     generator = np.random.default_rng(0)

@@ -56,6 +56,13 @@ class Config:
             "learning_rate_schedule", self.algorithm.learning_rate_schedule,
             "give max_updates or max_steps too: it must know how many updates there will be",
         )  # fmt: skip
+        by_share = [term.text for term in self.algorithm.scheduled_terms if not term.by_return]
+        require(
+            not by_share or self.planned_updates is not None,
+            "reward_schedule", " ".join(by_share),
+            "give max_updates or max_steps too: it must know how many updates there will be; or give its points as "
+            "evaluation returns, such as 1@return=500",
+        )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON-able dictionary; `from_dict` is its inverse."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from saclab.config import Config
-from saclab.errors import unknown_name
+from saclab.errors import require, unknown_name
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names, replace_settings
-from saclab.variants import default_settings, task_name, variant_changes
+from saclab.variants import default_settings, needed_settings, task_name, variant_changes
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,8 @@ def make_config(
     """
     changes = held_to(protocol_row(protocol).ceilings, variant_changes(variant, environment))
     said = protocol_settings(protocol, environment) | changes | dict(overrides or {})
+    for name, way_out in needed_settings(variant, environment).items():
+        require(name in (overrides or {}), name, None, f"{way_out} (variant {variant} on {environment})")
     algorithm, training = split_settings(said)
     return Config(
         environment=environment,
@@ -165,6 +167,19 @@ def make_config(
         training=TrainingSettings(**training),
         environment_arguments=dict(environment_arguments or {}),
     )
+
+
+def own_config(
+    environment: str,
+    variant: str,
+    protocol: str,
+    seed: int = 0,
+    environment_arguments: Mapping[str, Any] | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Config:
+    """What `make_config` gives, with what the variant needs and is not given left empty: to compare a run with."""
+    empty = dict.fromkeys(needed_settings(variant, environment), ())
+    return make_config(environment, variant, protocol, seed, environment_arguments, {**empty, **(overrides or {})})
 
 
 def held_to(ceilings: Mapping[str, int], settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -168,6 +168,8 @@ Q_BIAS: Columns = {
     "bias_spread": float | None, "seconds": float,
 }  # fmt: skip
 """From `pairs` on, the fields of `saclab.training.q_bias.QBias`: numbers but for an evaluation without pairs."""
+REWARD_TERMS: Columns = {**COUNTERS, "seconds": float}
+"""Beside them, of each term, its mean return and its weight (`saclab.training.logs.reward_term_columns`)."""
 METRICS: Columns = {"updates": Count, "steps": Count, "seconds": float}
 """Beside them whatever the variant reports."""
 

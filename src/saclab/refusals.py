@@ -82,10 +82,13 @@ def require_possible(settings: AlgorithmSettings) -> None:
         "entropy_window", settings.entropy_window,
         f"use 1 together with critic_head {settings.critic_head}: it averages numbers, not distributions",
     )  # fmt: skip
+    scheduled = {term.name for term in settings.scheduled_terms}
+    weighed = [name for name in settings.reward_terms if name not in scheduled]
     require(
-        len(settings.reward_weights) in (0, len(settings.reward_terms)),
+        len(settings.reward_weights) in (0, len(weighed)),
         "reward_weights", " ".join(map(str, settings.reward_weights)),
-        f"give one for each of the {len(settings.reward_terms)} reward_terms, or none",
+        f"give one for each of the {len(weighed)} reward_terms" + " without a reward_schedule" * bool(scheduled)
+        + ", or none",
     )  # fmt: skip
     require_possible_layers(settings)
     require_possible_critics(settings)

@@ -73,7 +73,7 @@ class RowLayout(NamedTuple):
 
 def layout_of(spec: EnvironmentSpec, settings: AlgorithmSettings) -> RowLayout:
     """The columns of a run's transitions."""
-    return RowLayout(spec.observation_size, spec.action_size, len(settings.reward_terms) + 1)
+    return RowLayout(spec.observation_size, spec.action_size, len(settings.terms_of_reward) + 1)
 
 
 class Windows(NamedTuple):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, ge
 from saclab.errors import require, unknown_name
 from saclab.limits import require_representable
 from saclab.refusals import UPDATES, require_known, require_possible, require_ranges
+from saclab.reward_schedule import ScheduledTerm, parse_schedule
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -144,14 +145,19 @@ class AlgorithmSettings:
     reward_terms: tuple[str, ...] = ()
     """Names of reward terms in the `info` of an environment's step; what they leave of the reward is a term too."""
     reward_weights: Annotated[tuple[float, ...], PLAIN_NUMBER] = ()
-    """The weight of each of `reward_terms` in the reward that is learned from; the remainder's is 1. None given: 1 for
-    each. Evaluations always count the environment's own reward."""
+    """The weight of each of `reward_terms` without a schedule in the reward that is learned from; the remainder's is 1.
+    None given: 1 for each. Evaluations always count the environment's own reward."""
+    reward_schedule: Annotated[tuple[str, ...], PLAIN_NUMBER] = ()
+    """Weights that change as training goes on, a text for each term: 'reward_linvel: 0.2@0.1 1@0.5' weighs it by 0.2 up
+    to a tenth of the planned updates, by 1 from half of them on; with points such as 1@return=3000, by the highest mean
+    evaluation return so far. Terms that are not among `reward_terms` are added to them."""
     reward_scaling: Literal["none", "deviation", "deviation_or_bound"] = "none"
     """What rewards are divided by when a batch is drawn: nothing, the running standard deviation of the discounted
     return, or the larger of it and the largest discounted return so far divided by `critic_bound`."""
 
     def __post_init__(self) -> None:
         lists_to_tuples(self)
+        object.__setattr__(self, "reward_schedule", tuple(term.text for term in self.scheduled_terms))
         require_representable(vars(self), plain_numbers())
         require_known(self, choices())
         require_ranges(self)
@@ -164,6 +170,16 @@ class AlgorithmSettings:
     @property
     def network_of_critic(self) -> NetworkName:
         return self.network if self.critic_network is None else self.critic_network
+
+    @cached_property
+    def scheduled_terms(self) -> tuple[ScheduledTerm, ...]:
+        return parse_schedule(self.reward_schedule)
+
+    @property
+    def terms_of_reward(self) -> tuple[str, ...]:
+        """All terms that the reward is split into: those that are named, and those of the schedule."""
+        scheduled = (term.name for term in self.scheduled_terms)
+        return (*self.reward_terms, *(name for name in scheduled if name not in self.reward_terms))
 
 
 @dataclass(frozen=True)
@@ -306,5 +322,5 @@ def structure(settings: AlgorithmSettings) -> AlgorithmSettings:
     defaults = {name: getattr(AlgorithmSettings, name) for name in plain_numbers()}
     return dataclasses.replace(
         settings, temperature="learned", critic_network=settings.network_of_critic,
-        critic_hidden_layers=settings.layers_of_critic, **defaults,
+        critic_hidden_layers=settings.layers_of_critic, reward_terms=settings.terms_of_reward, **defaults,
     )  # fmt: skip

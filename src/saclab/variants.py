@@ -25,6 +25,8 @@ class Variant:
     """What differs from plain SAC, and from the protocol: names of AlgorithmSettings and TrainingSettings."""
     by_environment: dict[str, dict[str, Any]] = field(default_factory=dict)
     """What differs further for environments whose id starts with a key."""
+    needs: dict[str, str] = field(default_factory=dict)
+    """Settings that have to be given where `by_environment` does not have them -> in words, what to give."""
     paper_name: str | None = None
     """The name of the system in the paper's figures and Table 2, if it stands there."""
     source: str = "the paper"
@@ -59,6 +61,28 @@ ENSEMBLE_ENTROPY = {"Hopper-": -1.0, "HalfCheetah-": -3.0, "Walker2d-": -3.0, "A
 """Target entropies of MBPO, REDQ and DroQ."""
 DROPOUT = {"Hopper-": 0.0001, "Walker2d-": 0.005, "Humanoid-": 0.1}
 """DroQ's rates of dropout, where they differ from 0.01."""
+STANDING_FIRST = {
+    "Humanoid-v4": {
+        "reward_terms": ("reward_linvel", "reward_quadctrl", "reward_alive"),
+        "reward_schedule": ("reward_linvel: 0.2@0.1 1@0.5",),
+    },
+    "Humanoid-v5": {
+        "reward_terms": ("reward_forward", "reward_ctrl", "reward_survive", "reward_contact"),
+        "reward_schedule": ("reward_forward: 0.2@0.1 1@0.5",),
+    },
+}
+"""The curriculum: at first forward motion counts a fifth, in the end what the environment says.
+
+The environment's own weights are 5 for each step on the feet, 1.25 for each m/s forward, 0.1 for the squared torques;
+the terms that it tells have them in them, so 1 leaves a term as it is. At 1 m/s, going forward earns a quarter of what
+standing does, and falling forward earns it too; with a fifth of the weight it is a twentieth. A tenth of the updates
+is for standing; from half of them on the reward is the one that is evaluated. What matters is how the terms compare,
+so that of standing keeps its weight, and Q its size.
+"""
+NEEDS_SCHEDULE = {
+    "reward_schedule": "this row does not know the terms of this environment's reward: name those that the info of its "
+    "steps tells, and their weights over training, as in --reward-schedule 'reward_forward: 0.2@0.1 1@0.5'"
+}
 
 COMPARED = ("sac", "sac-auto", "averaged", "averaged-auto")
 """The variants of a comparison, unless others are asked for."""
@@ -96,6 +120,20 @@ VARIANTS: dict[str, Variant] = {
         "α·log π, row by row over the last K unrelated minibatches. Kept to check their published numbers.",
         {"entropy_window": 10},
         cost=1.01,
+    ),
+    "curriculum": Variant(
+        "Curriculum, learned α",
+        "Humanoid's reward by a schedule: standing first, then forward; a learned temperature. The paper's second "
+        "future experiment.",
+        LEARNED,
+        STANDING_FIRST,
+        needs=NEEDS_SCHEDULE,
+    ),
+    "curriculum-fixed": Variant(
+        "Curriculum",
+        "The same schedule with a fixed temperature.",
+        by_environment=STANDING_FIRST,
+        needs=NEEDS_SCHEDULE,
     ),
     "redq": Variant(
         "REDQ",
@@ -261,6 +299,12 @@ def variant_changes(variant: str, environment: str) -> dict[str, Any]:
     row = VARIANTS[variant]
     here = [changes for prefix, changes in row.by_environment.items() if task_name(environment).startswith(prefix)]
     return functools.reduce(operator.or_, here, row.settings)
+
+
+def needed_settings(variant: str, environment: str) -> dict[str, str]:
+    """The settings that a variant's row has to be given on an environment, and in words, what to give."""
+    known = variant_changes(variant, environment)
+    return {name: way_out for name, way_out in VARIANTS[variant].needs.items() if name not in known}
 
 
 def variant_settings(variant: str, environment: str) -> AlgorithmSettings:

@@ -123,6 +123,27 @@ class Fragile(Constant):
         self.count, self.doomed = int(state["counters"][0]), bool(state["counters"][1])
 
 
+class Leaning(Constant):
+    """One step long; going right and going left are two terms of a reward that is always 0."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        right = float(action[0])
+        return np.ones(1, np.float32), 0.0, True, False, {"right": right, "left": -right}
+
+
+class Reticent(Leaning):
+    """It does not tell the terms of every step: not after `told` of them."""
+
+    def __init__(self, told: int = 1, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.told = told
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        *result, info = super().step(action)
+        self.told -= 1
+        return *result, info if self.told >= 0 else {}
+
+
 class Odd(gymnasium.Env):
     """It has the spaces that saclab refuses."""
 
@@ -144,4 +165,6 @@ gymnasium.register("Counting-v0", Counting, max_episode_steps=TIME_LIMIT)
 gymnasium.register("CapturableCounting-v0", CapturableCounting, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Constant-v0", Constant, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Fragile-v0", Fragile, max_episode_steps=TIME_LIMIT)
+gymnasium.register("Leaning-v0", Leaning, max_episode_steps=TIME_LIMIT)
+gymnasium.register("Reticent-v0", Reticent, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Odd-v0", Odd)

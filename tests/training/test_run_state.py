@@ -32,7 +32,9 @@ def test_evaluations_have_their_own_episodes_and_keep_the_best_policy(run):
 
     def enter(rewards, policy):
         seen.append(run.evaluation_seeds())
-        return run.enter_evaluation(EvaluationEpisodes(np.array(rewards), np.ones(2, np.int64)), np.array([policy]))
+        return run.enter_evaluation(
+            EvaluationEpisodes(np.array(rewards), np.ones(2, np.int64), np.array([rewards]).T), np.array([policy])
+        )
 
     assert enter([0.0, 1.0], 1)
     assert enter([100.0, 50.0], 2)

@@ -13,7 +13,7 @@ from saclab.settings import AlgorithmSettings, plain_numbers
 Scalars = dict[str, Any]
 """Name of a setting -> f32[] or i32[], NumPy or JAX; [R] where runs are mapped over."""
 
-ELSEWHERE = ("reward_weights", "target_entropy_per_action")
+ELSEWHERE = ("reward_weights", "reward_schedule", "target_entropy_per_action")
 """Settings that reach the update in its Context, or as part of another number."""
 
 NAMES = ("planned_updates", *(name for name in plain_numbers() if name not in ELSEWHERE))

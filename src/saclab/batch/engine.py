@@ -18,7 +18,7 @@ from saclab.errors import RunBroken
 from saclab.replay import draw
 from saclab.training.engine import NOTHING_HAPPENED, Broken, StepResult, never
 from saclab.training.evaluation import EvaluationEpisodes
-from saclab.training.learners import numbers_of, reward_weights
+from saclab.training.learners import numbers_of
 from saclab.training.q_bias import QBias
 from saclab.training.run_state import RunState
 from saclab.training.snapshot import EnvironmentStates, Snapshot, Start
@@ -62,7 +62,7 @@ class DeviceEngine:
         self.steps, self.updates = self.runs[0].counters.steps, self.runs[0].counters.updates
         self.active = list(range(len(starts)))
         self.numbers = self._put_stacked([numbers_of(config, replay.layout) for config in configs])
-        self.reward_weights = self._put_stacked([reward_weights(config.algorithm) for config in configs])
+        self.reward_weights = self._put_stacked([run.reward_weights() for run in self.runs])
         self.reward_scale = self._put_stacked([run.reward_scale.value for run in self.runs])
         self.observation_moments = self._put_stacked([run.observation_moments.value for run in self.runs])
         self.state: LearnerState = self._put_stacked([start.learner for start in starts])
@@ -137,7 +137,8 @@ class DeviceEngine:
             learner = self._learner(run)
             state = self.runs[run]
             header = {"do": "q_bias", "run": run, "evaluation": state.counters.evaluations + 1,
-                      "reward_scale": float(state.reward_scale.value)}  # fmt: skip
+                      "reward_scale": float(state.reward_scale.value),
+                      "reward_weights": state.reward_weights().tolist()}  # fmt: skip
             judged = {"actor": learner.actor, "critic": learner.critic, "log_alpha": learner.temperature}
             jobs.append((header, {name: np.asarray(trained.weights) for name, trained in judged.items()}))
         replies = self.pool.work_off(jobs, should_stop)
@@ -257,6 +258,7 @@ class DeviceEngine:
         rows = self.pool.buffers.row.reshape(len(runs), training.parallel_environments, -1).copy()
         before = self.steps - training.parallel_environments
         position = np.full(len(runs), before % training.replay_capacity, np.int32)
+        self._weigh_rewards()
         self._scale_rewards(rows, runs)
         self._enter_observations(rows, runs)
         self.experience = Experience(rows, position, self._draw(runs))
@@ -280,6 +282,12 @@ class DeviceEngine:
         """Updates that were made before the last step."""
         return self.training.updates_due(self.steps - self.training.parallel_environments)
 
+    def _weigh_rewards(self) -> None:
+        """Bring the weights of a round that begins to the devices, where a schedule changes them."""
+        due = self.training.updates_due(self.steps) > self.updates
+        if due and any(run.config.algorithm.reward_schedule for run in self.runs):
+            self.reward_weights = self._put_stacked([run.reward_weights() for run in self.runs])
+
     def _scale_rewards(self, rows: np.ndarray, runs: Sequence[RunState | None]) -> None:
         """Let the running scales take in the rewards of rows f32[runs, E, width], where rewards are scaled."""
         if not self.runs[0].reward_scale.active:
@@ -288,7 +296,7 @@ class DeviceEngine:
         for place, run in enumerate(runs):
             if run is not None:
                 terms = self.replay.layout.unpack(rows[place]).reward_terms
-                run.reward_scale.enter(np.asarray(terms) @ reward_weights(run.config.algorithm), ended[place])
+                run.reward_scale.enter(np.asarray(terms) @ run.reward_weights(), ended[place])
         self.reward_scale = self._put_stacked([run.reward_scale.value for run in self.runs])
 
     def _enter_observations(self, rows: np.ndarray, runs: Sequence[RunState | None]) -> None:

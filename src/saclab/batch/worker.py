@@ -53,7 +53,7 @@ class EnvironmentWorker:
         for share in task["shares"]:
             config = self.configs[share["run"]]
             environments = TrainingEnvironments(
-                config.environment, config.environment_arguments, share["seeds"], config.algorithm.reward_terms,
+                config.environment, config.environment_arguments, share["seeds"], config.algorithm.terms_of_reward,
                 config.training.wrappers,
             )  # fmt: skip
             rows = slice(share["first"], share["first"] + len(share["seeds"]))
@@ -61,8 +61,9 @@ class EnvironmentWorker:
             self.buffers.observation[rows] = environments.observation
         any_config = next(iter(self.configs.values()))
         self.evaluator = Evaluator(
-            any_config.environment, any_config.environment_arguments, any_config.training.wrappers
-        )
+            any_config.environment, any_config.environment_arguments, any_config.training.wrappers,
+            any_config.algorithm.terms_of_reward,
+        )  # fmt: skip
 
     def step(self) -> Message:
         """Step every active environment once; what went wrong in which run, and the numbers that belong to it."""
@@ -125,8 +126,9 @@ class EnvironmentWorker:
         """How far one run's critics are from Monte-Carlo soft returns."""
         config, learner = self.configs[header["run"]], self._learner(header["run"])
         critics = critics_of(
-            config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"], header["reward_scale"]
-        )
+            config, learner, arrays["actor"], arrays["critic"], arrays["log_alpha"], header["reward_scale"],
+            header["reward_weights"],
+        )  # fmt: skip
         try:
             environment, stop = self.evaluator.environments[0], self.buffers.stop
             bias = q_bias_at(config, critics, environment, header["evaluation"], lambda: bool(stop[0]))

@@ -16,7 +16,7 @@ from tyro.conf import OmitArgPrefixes, arg
 from saclab.config import Config
 from saclab.files import absolute
 from saclab.hub import is_address
-from saclab.protocols import make_config
+from saclab.protocols import own_config
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
 HELP = ("-h", "--help")
@@ -44,7 +44,7 @@ def named_config(arguments: Sequence[str]) -> Config:
     line.add_argument("--protocol", default="standard")
     named, _ = line.parse_known_args(arguments)
     environment = next(filter(AN_ENVIRONMENT.search, arguments), "HalfCheetah-v4")
-    return make_config(environment, named.variant, named.protocol)
+    return own_config(environment, named.variant, named.protocol)
 
 
 def options_of(kind: type[AlgorithmSettings | TrainingSettings], shown: object) -> Any:

@@ -7,7 +7,7 @@ from typing import Any, SupportsFloat
 
 import numpy as np
 
-from saclab.errors import NonFiniteError, SettingError
+from saclab.errors import NonFiniteError, RunBroken, SettingError
 from saclab.limits import LARGEST_FLOAT
 
 
@@ -37,3 +37,13 @@ def split_reward(
         if not abs(terms[-1]) <= LARGEST_FLOAT:
             raise NonFiniteError(f"{environment} gave the reward term {name} = {terms[-1]}")
     return *terms, float(reward) - sum(terms)
+
+
+def split_within_run(
+    environment: str, reward: SupportsFloat, info: Mapping[str, Any], names: Sequence[str]
+) -> tuple[float, ...]:
+    """The same for a run under way; raises RunBroken if a term is missing that its environment told at first."""
+    try:
+        return split_reward(environment, reward, info, names)
+    except SettingError as error:
+        raise RunBroken(f"{error}, though it did in the first step") from error

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from saclab.environments.checked import CheckedEnvironment
-from saclab.environments.reward_terms import split_reward
+from saclab.environments.reward_terms import split_within_run
 from saclab.errors import NonFiniteError, RunBroken
 
 LARGEST = float(np.finfo(np.float32).max)
@@ -88,7 +88,7 @@ class TrainingEnvironments:
             self._require_finite(index, seen, reward, scaled[index])
             next_observation[index], reward_terms[index, -1], terminated[index] = seen, reward, ends
             if self.reward_terms:
-                reward_terms[index] = split_reward(self.name, reward, info, self.reward_terms)
+                reward_terms[index] = split_within_run(self.name, reward, info, self.reward_terms)
             self.total_rewards[index] += reward
             self.lengths[index] += 1
             if ends or cut:

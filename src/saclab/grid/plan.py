@@ -12,7 +12,7 @@ from saclab.config import Config
 from saclab.errors import SettingError, require
 from saclab.files import absolute, same_directory
 from saclab.grid.sweep import swept_arms
-from saclab.protocols import make_config, protocol_row
+from saclab.protocols import make_config, own_config, protocol_row
 from saclab.training.run_folder import is_finished, run_path
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def make_grid(
     for seed, environment, variant, arm in product(
         seed_numbers(seeds, protocol), dict.fromkeys(environments), variants, arms
     ):
-        plain = make_config(environment, variant, protocol, seed, environment_arguments, overrides)
+        plain = own_config(environment, variant, protocol, seed, environment_arguments, overrides)
         config = make_config(
             environment, variant, protocol, seed, environment_arguments, {**(overrides or {}), **arm.settings}
         )

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import msgspec
 
 from saclab.errors import SettingError, require, unknown_name
+from saclab.reward_schedule import SETTING as SCHEDULE
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
 EXAMPLE = "polyak_rate=0.001,0.005"
@@ -50,7 +51,8 @@ def parse_sweep(texts: Sequence[str]) -> dict[str, tuple[Any, ...]]:
     """A sweep from the words of a command line.
 
     Args:
-        texts: each name=value,value,…; numbers within one value stand apart: hidden_layers=256 256,512 512.
+        texts: each name=value,value,…; numbers within one value stand apart: hidden_layers=256 256,512 512; terms of
+            one reward schedule have a semicolon between them.
 
     Raises:
         UserError: for a name that is no setting of the algorithm, or a value of another type.
@@ -70,8 +72,9 @@ def parse_value(name: str, text: str, hint: Any) -> Any:
     """One value of a setting; raises SettingError for text that is none."""
     lists, no_value = "tuple" in str(hint), type(None) in get_args(hint) and text.lower() == "none"
     require(bool(text), "sweep", name, f"a value is missing: write {EXAMPLE}")
+    parts = [part.strip() for part in text.split(";")] if name == SCHEDULE else text.split()
     try:
-        return msgspec.convert(None if no_value else text.split() if lists else text, hint, strict=False)
+        return msgspec.convert(None if no_value else parts if lists else text, hint, strict=False)
     except msgspec.ValidationError as error:
         raise SettingError("sweep", f"{name}={text}", str(error)) from error
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from saclab.config import Config
 from saclab.errors import UserError
 from saclab.machine import SIMULATION_PACKAGES, major
-from saclab.protocols import PROTOCOLS, make_config, training_settings
+from saclab.protocols import PROTOCOLS, own_config, training_settings
 from saclab.report.text import shown
 from saclab.settings import TrainingSettings
 from saclab.training.run_folder import RunRecord, safe_name
@@ -111,7 +111,7 @@ def own_training(config: Config) -> TrainingSettings | None:
         return None
     if config.variant not in VARIANTS:
         return training_settings(config.protocol, config.environment)
-    return make_config(config.environment, config.variant, config.protocol).training
+    return own_config(config.environment, config.variant, config.protocol).training
 
 
 def beside_variant(config: Config) -> dict[str, Any]:
@@ -120,7 +120,7 @@ def beside_variant(config: Config) -> dict[str, Any]:
     None for a variant or protocol that this version does not know: nothing tells which are its own.
     """
     try:
-        own = asdict(make_config(config.environment, config.variant, config.protocol).algorithm)
+        own = asdict(own_config(config.environment, config.variant, config.protocol).algorithm)
     except UserError:
         return {}
     return {name: value for name, value in asdict(config.algorithm).items() if value != own[name]}

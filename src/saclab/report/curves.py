@@ -65,6 +65,11 @@ DIAGNOSTICS = (
 COUNTERS = ("updates", "steps", "episodes", "seconds")
 """Columns of metrics.jsonl that are no metric."""
 
+OF_RETURN = "mean return of this reward term in an evaluation, as the environment tells it: they add up to the return"
+OF_WEIGHT = "what the critics' reward weighs the term by from the evaluation on"
+ROUNDING = 1e-6
+"""Share of the largest term's return below which another is rounding."""
+
 POINTS = 200
 """At most so many points per curve: beyond it one sees only noise."""
 ALL_POINTS = 50_000
@@ -113,8 +118,8 @@ def gather_curves(comparison: Comparison) -> Curves:
     points = max(20, min(POINTS, ALL_POINTS // len(comparison.runs)))
     gathered: Curves = {}
     for environment in comparison.environments:
-        others = other_metrics(comparison.runs_of(environment))
-        for quantity in PAPER_PANELS + DIAGNOSTICS + others:
+        runs_here = comparison.runs_of(environment)
+        for quantity in PAPER_PANELS + reward_terms(runs_here) + DIAGNOSTICS + other_metrics(runs_here):
             whole = {(arm, run.config.seed): curve
                      for arm in comparison.arms_of(environment)
                      for run in comparison.groups[environment, arm]
@@ -127,6 +132,25 @@ def gather_curves(comparison: Comparison) -> Curves:
                 if runs:
                     gathered[environment, arm, quantity] = ArmCurves(runs, band(list(runs.values())))
     return gathered
+
+
+def reward_terms(runs: Sequence[RunRecord]) -> tuple[Quantity, ...]:
+    """The return of each reward term of these runs, then its weight wherever a weight is not 1.
+
+    A remainder that is nothing but rounding is none.
+    """
+    logged = {name: None for run in runs for name in run.reward_terms}
+    values = {
+        name: np.concatenate([run.reward_terms[name] for run in runs if name in run.reward_terms]) for name in logged
+    }
+    largest = {name: np.abs(column).max(initial=0) for name, column in values.items() if name.startswith("return_")}
+    returns = [name for name, size in largest.items() if size > ROUNDING * max(largest.values())]
+    weights = [name for name, column in values.items() if name.startswith("weight_") and (column != 1).any()]
+    return tuple(
+        Quantity(f"term {name}", shown(name.replace("_", " of ", 1), 50), "reward_terms", name, "updates", meaning)
+        for names, meaning in ((returns, OF_RETURN), (weights, OF_WEIGHT))
+        for name in names
+    )
 
 
 def other_metrics(runs: Sequence[RunRecord]) -> tuple[Quantity, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from saclab.config import Config, flatten
 from saclab.errors import UserError
-from saclab.protocols import make_config
+from saclab.protocols import own_config
 
 IDENTITY = ("environment", "variant", "protocol", "seed", "environment_arguments")
 """What stands in the command anyway."""
@@ -30,7 +30,7 @@ def train_command(config: Config, name: str | None = None) -> str:
     if config.environment_arguments:
         words += ["--environment-arguments", json.dumps(config.environment_arguments)]
     try:
-        default = make_config(
+        default = own_config(
             config.environment, config.variant, config.protocol, config.seed, config.environment_arguments
         )
         settings = {name: here for name, (here, _) in config.differences(default).items()}

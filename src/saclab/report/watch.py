@@ -21,7 +21,15 @@ from saclab.training.run_folder import find_runs
 
 LOOPBACK = "127.0.0.1"
 NAMES = ("127.0.0.1", "localhost")
-WATCHED_FILES = ("config.json", "evaluations.csv", "episodes.csv", "metrics.jsonl", "q_bias.csv", "result.json")
+WATCHED_FILES = (
+    "config.json",
+    "evaluations.csv",
+    "episodes.csv",
+    "metrics.jsonl",
+    "q_bias.csv",
+    "reward_terms.csv",
+    "result.json",
+)
 WAITING = (
     '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="5"><title>saclab</title>'
     "<h1>Nothing to show yet</h1><p>{}</p>"

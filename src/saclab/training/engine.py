@@ -151,7 +151,7 @@ def spec_of(config: Config) -> EnvironmentSpec:
         config.environment, config.environment_arguments, wrappers=config.training.wrappers
     )
     try:
-        if names := config.algorithm.reward_terms:
+        if names := config.algorithm.terms_of_reward:
             environment.reset(seed=0)
             _, reward, _, _, info = environment.step(
                 environment.spec.scale_action(np.zeros(environment.spec.action_size))

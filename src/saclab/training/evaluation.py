@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from saclab.environments.checked import CheckedEnvironment
+from saclab.environments.reward_terms import split_within_run
 from saclab.errors import NonFiniteError, RunBroken
 
 
@@ -17,14 +18,22 @@ class EvaluationEpisodes(NamedTuple):
     """f64[episodes]."""
     lengths: np.ndarray
     """i64[episodes]."""
+    term_returns: np.ndarray
+    """f64[episodes, T]: the sums of the reward terms as the environment tells them; T = 1 is the return itself."""
 
 
 class Evaluator:
     """Environments of its own: an evaluation leaves training as it was."""
 
-    def __init__(self, environment: str, arguments: Mapping[str, Any], wrappers: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        environment: str,
+        arguments: Mapping[str, Any],
+        wrappers: Sequence[str] = (),
+        reward_terms: Sequence[str] = (),
+    ) -> None:
         self.make = partial(CheckedEnvironment, environment, arguments, wrappers=wrappers)
-        self.name, self.environments = environment, [self.make()]
+        self.name, self.environments, self.reward_terms = environment, [self.make()], tuple(reward_terms)
         self.spec = self.environments[0].spec
 
     @np.errstate(over="ignore")  # what is beyond 32 bits is refused as not finite
@@ -32,7 +41,7 @@ class Evaluator:
         """One episode per seed; `act` takes observations f32[n, O] and gives actions f32[n, A] in [-1, 1].
 
         Raises:
-            NonFiniteError: if an environment gives an observation or a reward that is not finite.
+            NonFiniteError: if an environment gives an observation, a reward or a term of it that is not finite.
             RunBroken: if one breaks its word or raises an error.
         """
         while len(self.environments) < len(seeds):
@@ -41,21 +50,23 @@ class Evaluator:
         for index, seed in enumerate(seeds):
             observation[index] = self.environments[index].reset(seed)
         total_rewards, lengths = np.zeros(len(seeds)), np.zeros(len(seeds), np.int64)
+        term_returns = np.zeros((len(seeds), len(self.reward_terms) + 1))
         self._require_finite(observation, total_rewards)
         active = list(range(len(seeds)))
         while active:
             actions = self.spec.scale_action(act(observation[active]))
             going_on = []
             for index, action in zip(active, actions, strict=True):
-                seen, reward, terminated, truncated, _ = self.environments[index].step(action)
+                seen, reward, terminated, truncated, info = self.environments[index].step(action)
                 observation[index] = seen
                 total_rewards[index] += reward
+                term_returns[index] += split_within_run(self.name, reward, info, self.reward_terms)
                 lengths[index] += 1
                 if not (terminated or truncated):
                     going_on.append(index)
             active = going_on
             self._require_finite(observation, total_rewards)
-        return EvaluationEpisodes(total_rewards, lengths)
+        return EvaluationEpisodes(total_rewards, lengths, term_returns)
 
     def _require_finite(self, observation: np.ndarray, total_rewards: np.ndarray) -> None:
         finite = np.isfinite(observation).all(axis=1) & np.isfinite(total_rewards)

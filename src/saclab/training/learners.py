@@ -35,12 +35,6 @@ def numbers_of(config: Config, layout: RowLayout) -> np.ndarray:
     return pack(scalars(config.algorithm, layout.action_size, config.planned_updates))
 
 
-def reward_weights(settings: AlgorithmSettings) -> np.ndarray:
-    """f32[T]: the weight of each reward term in the reward that is learned from; the remainder's is 1."""
-    named = settings.reward_weights or [1.0] * len(settings.reward_terms)
-    return np.array([*named, 1.0], np.float32)
-
-
 def initial_learner(config: Config, layout: RowLayout) -> LearnerState:
     """The state before a run's first update."""
     init = compiled_init(structure(config.algorithm), layout)

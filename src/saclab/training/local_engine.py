@@ -19,7 +19,7 @@ from saclab.training import seeds
 from saclab.training.checkpoint import Checkpoint, read_checkpoint
 from saclab.training.engine import NOTHING_HAPPENED, Broken, EnvironmentStateError, StepResult, never, spec_of
 from saclab.training.evaluation import EvaluationEpisodes, Evaluator
-from saclab.training.learners import compiled_update, learner_of, numbers_of, on_device, reward_weights
+from saclab.training.learners import compiled_update, learner_of, numbers_of, on_device
 from saclab.training.q_bias import QBias, critics_of, q_bias_at
 from saclab.training.requests import Stopped
 from saclab.training.snapshot import EnvironmentStates, Snapshot, Start, new_start
@@ -66,14 +66,16 @@ class LocalEngine:
         config = start.run.config
         self.environments = restored_environments(start)
         self.spec = self.environments.spec
-        self.evaluator = Evaluator(config.environment, config.environment_arguments, config.training.wrappers)
+        self.evaluator = Evaluator(
+            config.environment, config.environment_arguments, config.training.wrappers, config.algorithm.terms_of_reward
+        )
         self.learner = learner_of(config.algorithm, replay.layout)
         self.policy = self.learner.policy
         self.update = compiled_update(structure(config.algorithm), replay.layout)
         self.numbers = on_device(numbers_of(config, replay.layout))
-        self.reward_weights = reward_weights(config.algorithm)
+        run = self.run
         self.context = on_device(
-            Context(np.int32(0), self.reward_weights, self.run.reward_scale.value, self.run.observation_moments.value)
+            Context(np.int32(0), run.reward_weights(), run.reward_scale.value, run.observation_moments.value)
         )
         self.learner_state = on_device(start.learner)
         self._actor: np.ndarray | None = None
@@ -94,7 +96,7 @@ class LocalEngine:
         self.replay.add(transitions)
         if run.reward_scale.active:
             last = np.isin(np.arange(len(self.environments)), [episode.environment for episode in ended])
-            run.reward_scale.enter(transitions.reward_terms @ self.reward_weights, last)
+            run.reward_scale.enter(transitions.reward_terms @ run.reward_weights(), last)
             self.context = self.context._replace(reward_scale=run.reward_scale.value)
         if run.observation_moments.active:
             run.observation_moments.enter(transitions.observation)
@@ -107,6 +109,8 @@ class LocalEngine:
 
     def make_updates(self, should_pause: Callable[[], bool] = never) -> None:
         run, counters = self.run, self.run.counters
+        if run.config.algorithm.reward_schedule:
+            self.context = self.context._replace(reward_weights=run.reward_weights())
         for _ in range(run.updates_left):
             rows = self._sample()
             context = self.context._replace(step=np.int32(counters.updates))
@@ -182,6 +186,7 @@ class LocalEngine:
             np.array(state.critic.weights),
             np.asarray(state.temperature.weights),
             float(self.run.reward_scale.value),
+            self.run.reward_weights().tolist(),
         )
         try:
             environment, number = self.evaluator.environments[0], self.run.counters.evaluations + 1
@@ -207,7 +212,7 @@ def restored_environments(start: Start) -> TrainingEnvironments:
     config = start.run.config
     first_seeds = seeds.integers(config.seed, "environments", config.training.parallel_environments)
     environments = TrainingEnvironments(
-        config.environment, config.environment_arguments, first_seeds, config.algorithm.reward_terms,
+        config.environment, config.environment_arguments, first_seeds, config.algorithm.terms_of_reward,
         config.training.wrappers,
     )  # fmt: skip
     if start.environments is not None:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 
 from saclab.records import EPISODES, Q_BIAS, FileRecord, read_bytes, require_recorded
 
 LOGS = ("metrics.jsonl", "episodes.csv", "evaluations.csv", "q_bias.csv")
+OF_TERMS = "reward_terms.csv"
+"""The log of a run beside them whose reward is split into terms."""
+REMAINDER = "remainder"
+"""What the named terms leave of the reward."""
 EPISODE_COLUMNS = tuple(EPISODES)
 Q_BIAS_COLUMNS = tuple(Q_BIAS)
 
@@ -23,10 +28,31 @@ def evaluation_columns(episodes: int) -> tuple[str, ...]:
     return ("evaluation", "steps", "updates", "episodes", "mean_return", *returns, *lengths, "seconds")
 
 
+def reward_term_columns(terms: Sequence[str]) -> tuple[str, ...]:
+    """return_<term> of each term and of the remainder, then weight_<term> of each, which counts from then on.
+
+    A term whose name is no plain word has its number, from 0, in its place.
+    """
+
+    def is_plain(term: str) -> bool:
+        return bool(re.fullmatch(r"(?!\d+$)[A-Za-z0-9_.-]+", term)) and [*terms, REMAINDER].count(term) == 1
+
+    plain = [term if is_plain(term) else str(number) for number, term in enumerate(terms)]
+    returns = [f"return_{name}" for name in (*plain, REMAINDER)]
+    weights = [f"weight_{name}" for name in plain]
+    return ("evaluation", "steps", "updates", "episodes", *returns, *weights, "seconds")
+
+
 class Logs:
     """The growing files of a run; what they are up to now is part of a checkpoint."""
 
-    def __init__(self, run: Path, evaluation_episodes: int, recorded: Mapping[str, FileRecord] | None) -> None:
+    def __init__(
+        self,
+        run: Path,
+        evaluation_episodes: int,
+        recorded: Mapping[str, FileRecord] | None,
+        reward_terms: Sequence[str] = (),
+    ) -> None:
         """Open for appending, cut back to what was `recorded`, or start anew with header lines if nothing was.
 
         Raises:
@@ -38,7 +64,9 @@ class Logs:
             "metrics.jsonl": "",
             "q_bias.csv": ",".join(Q_BIAS_COLUMNS) + "\n",
         }
-        beginnings = {name: recorded_beginning(run / name, (recorded or {}).get(name)) for name in LOGS}
+        if reward_terms:
+            headers[OF_TERMS] = ",".join(reward_term_columns(reward_terms)) + "\n"
+        beginnings = {name: recorded_beginning(run / name, (recorded or {}).get(name)) for name in headers}
         self.files, self.written = {}, {}
         for name, beginning in beginnings.items():
             file = (run / name).open("r+" if (run / name).exists() else "w+", newline="")
@@ -59,6 +87,9 @@ class Logs:
 
     def q_bias(self, *row: object) -> None:
         csv.writer(self.files["q_bias.csv"], lineterminator="\n").writerow(row)
+
+    def reward_terms(self, *row: object) -> None:
+        csv.writer(self.files[OF_TERMS], lineterminator="\n").writerow(row)
 
     def metrics(self, values: dict[str, float | int]) -> None:
         self.files["metrics.jsonl"].write(json.dumps(values, allow_nan=False) + "\n")

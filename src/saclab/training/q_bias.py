@@ -3,7 +3,8 @@
 The measure of Chen et al. 2021 ("Randomized Ensembled Double Q-Learning", section 3): the normalised bias
 (Q(s, a) − G) / |mean of G|, its mean and its standard deviation over the state-action pairs of a few episodes of the
 policy. G is the soft return that SAC's Q stands for (Eq. 1, Eq. 4): the reward, then the discounted rewards and
-entropy bonuses that follow.
+entropy bonuses that follow. The reward is the one that the critics learn from: its terms weighed as they are at that
+moment, and scaled.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from saclab.algorithm.policy import Policy
 from saclab.algorithm.targets import reduced_q
 from saclab.config import Config
 from saclab.environments.checked import CheckedEnvironment
+from saclab.environments.reward_terms import split_within_run
 from saclab.errors import NonFiniteError
 from saclab.training import seeds
 from saclab.training.requests import Stopped
@@ -43,6 +45,9 @@ class Critics(NamedTuple):
     """How the policy loss reduces the critics to one Q: the setting actor_reduction."""
     reward_scale: float = 1.0
     """What the critics' rewards are divided by: their Q is that of scaled rewards, so the truth must be too."""
+    reward_terms: tuple[str, ...] = ()
+    reward_weights: tuple[float, ...] = (1.0,)
+    """Of the terms and of the remainder: likewise, the truth is that of the reward as it is weighed now."""
 
     def q(self, observation: np.ndarray, action: np.ndarray) -> np.ndarray:
         """What the policy is trained to raise: f32[n] for f32[n, O] and f32[n, A]."""
@@ -72,7 +77,7 @@ class Episode(NamedTuple):
     action: np.ndarray
     """f32[T, A]."""
     reward: np.ndarray
-    """f64[T]."""
+    """f64[T], weighed."""
     log_prob: np.ndarray
     """f64[T]."""
     terminated: bool
@@ -85,12 +90,13 @@ def critics_of(
     critic: np.ndarray,
     log_alpha: np.ndarray | float,
     reward_scale: float,
+    reward_weights: Sequence[float],
 ) -> Critics:
     """The critics of a run, and what their Q stands for."""
     settings = config.algorithm
     return Critics(
         learner.policy, actor, learner.q_values, critic, float(np.exp(np.asarray(log_alpha))), settings.discount,
-        settings.actor_reduction, reward_scale,
+        settings.actor_reduction, reward_scale, settings.terms_of_reward, tuple(reward_weights),
     )  # fmt: skip
 
 
@@ -150,8 +156,10 @@ def play(
         seen = np.array(observation, np.float32)[None]  # the environment may write over its own
         noise = generator.standard_normal((1, spec.action_size), np.float32)
         action, log_prob = act(critics.actor, seen, noise)
-        observation, reward, terminated, truncated, _ = environment.step(spec.scale_action(action)[0])
-        rows.append((seen[0], action[0], reward, float(log_prob[0])))
+        observation, reward, terminated, truncated, info = environment.step(spec.scale_action(action)[0])
+        terms = split_within_run(environment.name, reward, info, critics.reward_terms)
+        weighed = sum(weight * term for weight, term in zip(critics.reward_weights, terms, strict=True))
+        rows.append((seen[0], action[0], weighed, float(log_prob[0])))
         if terminated or truncated:
             break
     if not (np.isfinite(observation).all() and all(np.isfinite([*seen, reward]).all() for seen, _, reward, _ in rows)):

@@ -4,6 +4,7 @@ config.json          everything resolved, versions, machine
 metrics.jsonl        one line per window of updates
 episodes.csv         one line per training episode
 evaluations.csv      one line per evaluation, with every episode's return
+reward_terms.csv     likewise, with each reward term's mean return and weight, if there are terms
 checkpoints/         what `saclab resume` continues from
 best/                the policy with the best evaluation return
 result.json          written when the run has finished
@@ -31,6 +32,7 @@ from saclab.records import (
     JSON_BYTES,
     METRICS,
     Q_BIAS,
+    REWARD_TERMS,
     Count,
     Damaged,
     FileRecord,
@@ -47,7 +49,7 @@ from saclab.records import (
     table_from_csv,
     table_from_json_lines,
 )
-from saclab.training.logs import evaluation_columns
+from saclab.training.logs import OF_TERMS, evaluation_columns
 from saclab.training.manifest import CheckpointError, newest_first, read_manifest
 from saclab.training.saved_state import files_in
 
@@ -179,6 +181,8 @@ class RunRecord(NamedTuple):
     """The columns of Q_BIAS_COLUMNS; empty arrays if it was not measured."""
     result: dict[str, Any] | None
     """result.json of a finished run."""
+    reward_terms: dict[str, np.ndarray] = {}  # noqa: RUF012 - read only
+    """The columns of `reward_term_columns`; empty for a run whose reward is not split."""
 
 
 def read_run(run: Path) -> RunRecord:
@@ -213,6 +217,7 @@ def read_run(run: Path) -> RunRecord:
         metrics=table_from_json_lines(run / "metrics.jsonl", log("metrics.jsonl"), METRICS),
         q_bias=table_from_csv(run / "q_bias.csv", log("q_bias.csv"), Q_BIAS),
         result=None if result is None else msgspec.to_builtins(result),
+        reward_terms=table_from_csv(run / OF_TERMS, log(OF_TERMS), REWARD_TERMS),
     )
 
 

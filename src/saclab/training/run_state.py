@@ -17,6 +17,7 @@ from saclab.training.exploration import Exploration
 from saclab.training.manifest import Moment
 from saclab.training.observation_moments import ObservationMoments
 from saclab.training.reward_scale import RewardScale
+from saclab.training.reward_weights import reward_weights
 from saclab.training.saved_state import Counters
 
 RUNNING_AVERAGE_KEEP = 0.8  # the paper's running average: 0.8 old + 0.2 new
@@ -73,6 +74,23 @@ class RunState:
     def updates_left(self) -> int:
         """Updates that the steps so far make due and that have not been made: above 0, a round is under way."""
         return self.config.training.updates_due(self.counters.steps) - self.counters.updates
+
+    # --- rewards
+
+    def reward_weights(self) -> np.ndarray:
+        """f32[T]: what the reward terms are weighed by in the round of updates that is under way, or in the next one.
+
+        A schedule goes by the share of the planned updates that were made when the round began, and by the best
+        evaluation until then: all updates between two steps have the same weights, whoever makes them.
+        """
+        planned = self.config.planned_updates or 1
+        return reward_weights(self.config.algorithm, self._round_start / planned, self.counters.best_return)
+
+    @property
+    def _round_start(self) -> int:
+        """Updates made before the round that is under way, or before the next one."""
+        training, steps = self.config.training, self.counters.steps
+        return training.updates_due(steps - training.parallel_environments if self.updates_left > 0 else steps)
 
     # --- evaluations
 

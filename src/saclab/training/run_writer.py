@@ -47,7 +47,8 @@ class RunWriter:
         self.warned_of_temperature = self.policy_was_read = False
         self.resumed_at_step = self.run.counters.steps
         self._write_best()
-        self.logs = Logs(folder, self.run.config.training.evaluation_episodes, beginning.logs)
+        config = self.run.config
+        self.logs = Logs(folder, config.training.evaluation_episodes, beginning.logs, config.algorithm.terms_of_reward)
         self.config_file = file_record(read_bytes(folder / "config.json"))
         self._record_session()
         self.seconds_before, self.started = self.run.counters.seconds, time.monotonic()
@@ -108,12 +109,18 @@ class RunWriter:
         )
 
     def log_evaluation(self, episodes: EvaluationEpisodes, best: bool, bias: QBias | None) -> Evaluated:
-        """Log an evaluation that the run has taken in already, with the critics' bias after it where it is measured."""
+        """Log an evaluation that the run has taken in, and beside it the terms of its return and the critics' bias."""
         counters = self.run.counters
         self.logs.evaluation(
             counters.evaluations, counters.steps, counters.updates, counters.episodes, counters.last_return,
             *episodes.total_rewards.tolist(), *episodes.lengths.tolist(), self._seconds(),
         )  # fmt: skip
+        if self.run.config.algorithm.terms_of_reward:
+            *weights, _ = self.run.reward_weights()
+            self.logs.reward_terms(
+                counters.evaluations, counters.steps, counters.updates, counters.episodes,
+                *episodes.term_returns.mean(axis=0).tolist(), *weights, self._seconds(),
+            )  # fmt: skip
         if bias is not None:
             self.logs.q_bias(
                 counters.evaluations, counters.steps, counters.updates, counters.episodes, *bias, self._seconds()

@@ -61,7 +61,7 @@ Space = dict[str, Range | Choice]
 NOT_SEARCHED = (
     "wrappers", "max_steps", "max_updates", "max_episodes", "patience_episodes", "evaluation_interval_episodes",
     "evaluation_interval_steps", "evaluation_episodes", "q_bias_episodes", "log_interval", "reward_terms",
-    "reward_weights", "update_order",
+    "reward_weights", "reward_schedule", "update_order",
 )  # fmt: skip
 """Settings that decide how long a trial is and how it is judged, or that no range can say."""
 LEARNING_RATE = Range(1e-4, 5e-3, log=True)

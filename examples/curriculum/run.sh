@@ -1,0 +1,60 @@
+#!/usr/bin/env bash
+# Trains every run of docs/curriculum.md, two at a time, seed by seed. Stop it at any instant (Ctrl-C, SIGTERM to the
+# process group, a power cut): the same command goes on, finished runs are skipped, and those whose results lie in
+# examples/curriculum/runs beside this file already.
+#
+#   examples/curriculum/run.sh RUNS [SEEDS_OF_HUMANOID [SEEDS_OF_HALF_CHEETAH]]
+#
+# SACLAB names the program, if it is not on the PATH.
+set -euo pipefail
+runs=${1:?the folder that holds the runs}
+kept=$(dirname "$(realpath "$0")")/runs
+humanoid_seeds=${2:-3}
+half_cheetah_seeds=${3:-3}
+
+# jaxlib 0.10.2 can compile large matrix products wrongly through these fusions (jax issue 39103): not used here.
+export XLA_FLAGS="--xla_cpu_experimental_ynn_fusion_type="
+
+# Linux weighs sessions against each other before it weighs processes, so nice gives way only within its own: started
+# as a session of its own (setsid examples/curriculum/run.sh RUNS &), this one gives way as a whole.
+if [[ $(ps -o sid= -p $$) -eq $$ ]]; then
+  { echo 19 >/proc/self/autogroup; } 2>/dev/null || true
+fi
+if command -v ionice >/dev/null; then
+  ionice -c 3 -p $$ 2>/dev/null || true
+fi
+
+humanoid() {  # name, variant and settings of an arm; xargs takes what stands between quotes as one word
+  cat <<'ARMS'
+sac-auto sac-auto --reward-terms reward_linvel reward_quadctrl reward_alive
+curriculum curriculum
+curriculum-slow curriculum --reward-schedule 'reward_linvel: 0.2@0.3 1@0.9'
+ARMS
+}
+
+half_cheetah() {
+  cat <<'ARMS'
+sac-auto sac-auto --reward-terms reward_run reward_ctrl
+control-late sac-auto --reward-terms reward_run --reward-schedule 'reward_ctrl: 0@0.4 4@0.6'
+ARMS
+}
+
+commands() {  # environment, number of seeds, limits of the run; the arms come on standard input
+  local environment=$1 seeds=$2 arms seed name variant settings
+  shift 2
+  arms=$(cat)
+  for ((seed = 0; seed < seeds; seed++)); do
+    while read -r name variant settings; do
+      [[ -e "$kept/$environment/$name/paper/seed-$seed" ]] && continue
+      echo "train $environment --variant $variant --name $name $settings --seed $seed --protocol paper" \
+        "$* --q-bias-episodes 2 --threads 1 --checkpoint-minutes 5 --runs $runs"
+    done <<<"$arms"
+  done
+}
+
+mkdir -p "$runs"
+{
+  half_cheetah | commands HalfCheetah-v4 "$half_cheetah_seeds" --max-updates 30000
+  humanoid | commands Humanoid-v4 "$humanoid_seeds" --max-updates 60000 --patience-episodes None
+} | xargs -P 2 -L 1 --process-slot-var=CORE \
+  bash -c 'exec taskset --cpu-list "$CORE" nice -n 19 "${SACLAB:-saclab}" "$@" >>"$0/log.txt" 2>&1' "$runs"

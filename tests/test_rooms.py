@@ -12,8 +12,8 @@ import saclab
 HOUSE = Path(saclab.__file__).parent
 ROOMS = (
     "errors", "extras", "files", "limits", "reward_schedule", "refusals", "settings", "config", "variants", "protocols",
-    "machine", "records", "algorithm", "environments", "replay", "memory", "trained_policy", "onnx_export", "training",
-    "signals", "exits", "batch", "grid", "report", "playback", "play", "tuning", "api", "cli",
+    "machine", "records", "hub", "algorithm", "environments", "replay", "memory", "trained_policy", "onnx_export",
+    "training", "signals", "exits", "batch", "grid", "report", "playback", "play", "sharing", "tuning", "api", "cli",
 )  # fmt: skip
 """From the ground up: a room imports itself and what stands before it."""
 FILE_LINES, FUNCTION_LINES, NAME_LETTERS = 350, 55, 70

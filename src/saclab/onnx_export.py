@@ -19,7 +19,7 @@ from saclab.errors import UserError
 from saclab.extras import required
 from saclab.files import absolute, replace_file
 from saclab.records import PolicyDescription
-from saclab.trained_policy import TrainedPolicy, load_policy, read_description
+from saclab.trained_policy import TrainedPolicy, load_policy, on_disk, read_description
 
 OPERATIONS = {
     "add": "Add", "divide": "Div", "exp": "Exp", "greater": "Greater", "matmul": "MatMul", "maximum": "Max",
@@ -156,7 +156,7 @@ def export_onnx(run: Path | str, path: Path | str) -> None:
     the environment's bounds and are of its type; normalisation of observations is inside.
 
     Args:
-        run: the run folder, or a folder that holds a policy.
+        run: the run folder, a folder that holds a policy, or hf:user/name.
         path: of the file.
 
     Raises:
@@ -164,7 +164,8 @@ def export_onnx(run: Path | str, path: Path | str) -> None:
             have, or the file cannot be written.
     """
     required("onnx", "onnx", "export")
-    policy, description = load_policy(Path(run)), read_description(Path(run))
+    run = on_disk(run)
+    policy, description = load_policy(run), read_description(run)
     model, path = onnx_model(policy, description), absolute(Path(path))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

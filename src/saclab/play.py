@@ -17,9 +17,8 @@ from gymnasium.error import DependencyNotInstalled
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.wrappers import require_import_allowed
 from saclab.errors import RunBroken, UserError, in_words
-from saclab.files import absolute
-from saclab.playback import require_fit, require_seed
-from saclab.trained_policy import TrainedPolicy, load_policy, read_description
+from saclab.playback import for_tracebacks, require_fit, require_seed
+from saclab.trained_policy import TrainedPolicy, load_policy, on_disk, read_description
 from saclab.training.failure import tell_of_closing, tracebacks_in
 
 
@@ -36,7 +35,7 @@ def play(
     """Show a run's best policy, episode by episode, at the environment's own speed.
 
     Args:
-        run: the run folder, or a folder that holds a policy.
+        run: the run folder, a folder that holds a policy, or hf:user/name.
         episodes: how many; None for no end. They start as those of `evaluate` with the same seed.
         seed: of their starts.
         deterministic: the mean action, in place of a sample.
@@ -48,13 +47,14 @@ def play(
     Raises:
         UserError: if the run has no policy, its environment would import a package not named in `imports`, or there
             is no display to show it on.
-        RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
+        RunBroken: if the environment raises an error, or breaks its word; a traceback is left in `run`, or in the
+            working directory if that is hf:user/name.
     """
     require_seed(seed)
+    run, left_in = on_disk(run), for_tracebacks(run)
     policy, description = load_policy(run), read_description(run)
-    run = absolute(run)
     require_import_allowed(description.environment, description.wrappers, imports)
-    with tracebacks_in([run]):
+    with tracebacks_in([left_in]):
         environment = CheckedEnvironment(
             description.environment, description.environment_arguments, "human", description.wrappers
         )
@@ -67,7 +67,7 @@ def play(
                     return
                 yield played
         finally:
-            tell_of_closing([(0, error) for error in [environment.close()] if error], [run])
+            tell_of_closing([(0, error) for error in [environment.close()] if error], [left_in])
 
 
 def starts(seed: int, number: int) -> int:

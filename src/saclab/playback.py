@@ -16,8 +16,9 @@ from saclab.environments.make import EnvironmentSpec
 from saclab.environments.wrappers import require_import_allowed
 from saclab.errors import RunBroken, UserError, require
 from saclab.files import absolute
+from saclab.hub import is_address
 from saclab.records import PolicyDescription
-from saclab.trained_policy import TrainedPolicy, load_policy, read_description
+from saclab.trained_policy import TrainedPolicy, load_policy, on_disk, read_description
 from saclab.training.evaluation import Evaluator
 from saclab.training.failure import tell_of_closing, tracebacks_in
 
@@ -43,28 +44,34 @@ class EvaluationResult(NamedTuple):
 def evaluate(
     run: Path, episodes: int, seed: int, deterministic: bool = True, imports: Sequence[str] = ()
 ) -> EvaluationResult:
-    """Evaluate a run's best policy.
+    """Evaluate the best policy of a run, from its folder or from the Hugging Face Hub.
 
     Raises:
         UserError: if the run has no policy, or its environment would import a package not named in `imports`.
-        RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
+        RunBroken: if the environment raises an error, or breaks its word; a traceback is left in `run`, or in the
+            working directory if that is hf:user/name.
     """
     require_seed(seed)
+    run, left_in = on_disk(run), for_tracebacks(run)
     policy, description = load_policy(run), read_description(run)
-    run = absolute(run)
     require_import_allowed(description.environment, description.wrappers, imports)
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
-    with tracebacks_in([run]):
+    with tracebacks_in([left_in]):
         evaluator = Evaluator(description.environment, description.environment_arguments, description.wrappers)
         try:
             require_fit(policy, description.environment, evaluator.spec)
             result = evaluator.run(partial(policy.normalised_action, deterministic=deterministic), seeds)
         finally:
-            tell_of_closing([(0, error) for error in evaluator.close()], [run])
+            tell_of_closing([(0, error) for error in evaluator.close()], [left_in])
     return EvaluationResult(
         description.environment, episodes, float(result.total_rewards.mean()), float(result.total_rewards.std()),
         result.total_rewards.tolist(), result.lengths.tolist(),
     )  # fmt: skip
+
+
+def for_tracebacks(run: Path) -> Path:
+    """Where an environment's traceback is left: the run's folder; the working directory for a policy of the Hub's."""
+    return absolute("." if is_address(run) else run)
 
 
 def require_seed(seed: int) -> None:
@@ -86,16 +93,18 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
     Raises:
         UserError: if the run has no policy, its environment would import a package not named in `imports`, or cannot
             be rendered here.
-        RunBroken: if the environment raises an error, whose traceback is left in `run`, or breaks its word.
+        RunBroken: if the environment raises an error, or breaks its word; a traceback is left in `run`, or in the
+            working directory if that is hf:user/name.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     require_seed(seed)
+    run, left_in = on_disk(run), for_tracebacks(run)
     policy, description = load_policy(run), read_description(run)
-    run, given, video = absolute(run), video, absolute(video)
+    given, video = video, absolute(video)
     require_import_allowed(description.environment, description.wrappers, imports)
     require_place(video)
-    with tracebacks_in([run]):
+    with tracebacks_in([left_in]):
         environment = filmed_environment(description, size)
         try:
             require_fit(policy, description.environment, environment.spec)
@@ -103,7 +112,7 @@ def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Se
             require_rendering(environment)
             total_reward, filmed = film_to(video, environment, policy, steps, seed)
         finally:
-            tell_of_closing([(0, error) for error in [environment.close()] if error], [run])
+            tell_of_closing([(0, error) for error in [environment.close()] if error], [left_in])
     return f"{given}: {filmed} steps, return {total_reward:.1f} until then"
 
 

@@ -17,7 +17,8 @@ from saclab.config import Config, from_plain
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.files import replace_file, write_json
-from saclab.records import UNREADABLE, Damaged, PolicyDescription, is_there, read_bytes, read_json
+from saclab.hub import download, is_address
+from saclab.records import JSON_BYTES, UNREADABLE, Damaged, PolicyDescription, is_there, read_bytes, read_json
 from saclab.settings import AlgorithmSettings
 
 ACTION_TYPES = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
@@ -25,6 +26,8 @@ ARRAYS, DESCRIPTION = "policy.safetensors", "policy.json"
 CHECKSUM = "checksum"
 """An array among the others, u8[32]: in their file, so that a crash between the two files leaves a policy that is
 whole. Policies of before November 2026 have none."""
+POLICY_BYTES = {DESCRIPTION: JSON_BYTES, ARRAYS: 2**32}
+"""The files of a policy, and what somebody else's may have at most."""
 RETRAIN = "train again, or resume the run if it is unfinished"
 
 
@@ -97,6 +100,15 @@ def checksum(arrays: dict[str, np.ndarray], description: PolicyDescription) -> n
     return np.frombuffer(hashlib.sha256(content).digest(), np.uint8)
 
 
+def on_disk(run: Path | str) -> Path:
+    """The folder of a run; for hf:user/name[@revision] that of its policy, downloaded if need be.
+
+    Raises:
+        UserError: if there is no such model on the Hugging Face Hub, or it cannot be reached.
+    """
+    return download(run, POLICY_BYTES) if is_address(run) else Path(run)
+
+
 def policy_folder(run: Path) -> Path:
     """Where the policy of a run lies: `best` in a run folder, or the folder itself."""
     return run / "best" if is_folder(run / "best") else run
@@ -116,12 +128,15 @@ def read_description(run: Path) -> PolicyDescription:
 
 
 def load_policy(run: Path | str) -> TrainedPolicy:
-    """The best policy of a run, from its folder or from its `best` folder.
+    """The best policy of a run, from its folder, from its `best` folder, or from the Hugging Face Hub.
+
+    Args:
+        run: the folder; or hf:user/name, or hf:user/name@revision, which need the extra `hub`.
 
     Raises:
-        UserError: if there is none, or its files are damaged.
+        UserError: if there is none, its files are damaged, or the Hub cannot be reached.
     """
-    folder = policy_folder(Path(run))
+    folder = policy_folder(on_disk(run))
     if not is_folder(folder):
         raise UserError(f"there is no folder {run}: give that of a run, or its best policy's")
     if not is_there(folder / ARRAYS):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import subcommand
 
-from saclab.cli.results import Evaluate, Export, Play, Protocols, Record, Report, Variants, Watch
+from saclab.cli.results import Evaluate, Export, Play, Protocols, Record, Report, Share, Variants, Watch
 from saclab.cli.settings import with_absolute_paths, with_settings
 from saclab.cli.streams import output_lost, use_lasting_streams
 from saclab.cli.training import Compare, Reproduce, Resume, Train
@@ -42,6 +43,8 @@ def run(arguments: Sequence[str]) -> int:
     if list(arguments) == ["--version"]:
         print(f"saclab {version('saclab')}")
         return 0
+    if not sys.stderr.isatty():
+        os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     command = with_absolute_paths(parse(arguments))
     from rich.console import Console
 
@@ -63,6 +66,7 @@ def parse(arguments: Sequence[str]) -> Any:
         | Annotated[Record, subcommand("record")]
         | Annotated[Play, subcommand("play")]
         | Annotated[Export, subcommand("export")]
+        | Annotated[Share, subcommand("share")]
         | Annotated[Variants, subcommand("variants")]
         | Annotated[Protocols, subcommand("protocols")]
     )

@@ -26,7 +26,7 @@ class Evaluate:
     """Evaluate a run's best policy on fresh episodes."""
 
     run: Positional[Path]
-    """The run folder, or a folder that holds a policy."""
+    """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     episodes: int = 20
     """How many episodes, stepped side by side."""
     seed: int = 1_000_000
@@ -55,9 +55,10 @@ class Record:
     """Film a run's best policy; needs no screen."""
 
     run: Positional[Path]
-    """The run folder."""
+    """The run folder, or hf:user/name[@revision] of the Hugging Face Hub."""
     video: Path | None = None
-    """File to write, .mp4 or .gif; None for best/video.mp4 in the run folder, where the report finds it."""
+    """File to write, .mp4 or .gif; None for best/video.mp4 in the run folder, where the report finds it, or for
+    name.mp4 here if the policy is the Hub's."""
     steps: int = 300
     """Environment steps to film at most."""
     seed: int = 1_000_000
@@ -70,10 +71,17 @@ class Record:
     def __call__(self, console: Console) -> int:
         from saclab import playback
 
-        path = self.video or self.run / "best" / "video.mp4"
+        path = self.video or beside(self.run, "mp4") or self.run / "best" / "video.mp4"
         told = playback.record(self.run, path, self.steps, self.seed, self.size, self.imports)
         console.print(told, soft_wrap=True, markup=False)
         return 0
+
+
+def beside(run: Path, ending: str) -> Path | None:
+    """name.<ending> in the working directory for a policy of the Hub's, beside which nothing is written; else None."""
+    from saclab import hub
+
+    return Path(f"{hub.parsed(run).repository.partition('/')[2]}.{ending}") if hub.is_address(run) else None
 
 
 @dataclass(frozen=True)
@@ -81,7 +89,7 @@ class Play:
     """Show a run's best policy in a window, episode after episode, until it is closed or Ctrl-C."""
 
     run: Positional[Path]
-    """The run folder, or a folder that holds a policy."""
+    """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     episodes: int | None = None
     """How many episodes; None for no end."""
     seed: int = 1_000_000
@@ -113,17 +121,60 @@ class Export:
     """
 
     run: Positional[Path]
-    """The run folder, or a folder that holds a policy."""
+    """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     out: Path | None = None
-    """File to write; None for policy.onnx beside the policy."""
+    """File to write; None for policy.onnx beside the policy, or for name.onnx here if that is the Hub's."""
 
     def __call__(self, console: Console) -> int:
         from saclab.onnx_export import export_onnx
         from saclab.trained_policy import policy_folder
 
-        path = self.out or policy_folder(self.run) / "policy.onnx"
+        path = self.out or beside(self.run, "onnx") or policy_folder(self.run) / "policy.onnx"
         export_onnx(self.run, path)
         console.print(str(path), soft_wrap=True, markup=False, highlight=False)
+        return 0
+
+
+@dataclass(frozen=True)
+class Share:
+    """Put a run's best policy on the Hugging Face Hub, with a model card; needs the extra `hub`.
+
+    What is sent is listed first: the policy, config.json and result.json without what tells of this machine,
+    evaluations.csv, a film, the card.
+    """
+
+    run: Positional[Path]
+    """The run folder."""
+    repository: Positional[str]
+    """user/name on the Hub; made if there is none."""
+    folder: Path | None = None
+    """Write there what would be sent, for a look at it, and send nothing."""
+    private: bool = False
+    """Make the repository so that only its owner sees it."""
+    license: str | None = None
+    """For the card: an identifier of the Hub's, such as mit."""
+    video: bool = False
+    """Film an episode anew; else best/video.mp4 is taken, if there is one of this policy."""
+    onnx: bool = False
+    """Add the policy as an ONNX file; needs the extra `onnx` too."""
+    episodes: int = 20
+    """How many fresh episodes the card's score is of."""
+    seed: int = 1_000_000
+    """Seed of their starts, another than in training, where the policy was chosen."""
+    imports: tuple[str, ...] = ()
+    """Packages that the run's environment may import; a run folder alone is not trusted to name one."""
+    paths_too: bool = False
+    """Publish paths of this machine that are among the settings or the environment's arguments."""
+
+    def __call__(self, console: Console) -> int:
+        from dataclasses import asdict
+
+        from saclab.sharing.share import share
+
+        def tell(text: str) -> None:
+            console.print(text, soft_wrap=True, markup=False, highlight=False)
+
+        tell(share(**asdict(self), tell=tell))
         return 0
 
 

@@ -15,6 +15,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from saclab.config import Config
 from saclab.files import absolute
+from saclab.hub import is_address
 from saclab.protocols import own_config
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
@@ -65,7 +66,7 @@ def with_absolute_paths(command: Any) -> Any:
     def stable(value: Any) -> Any:
         match value:
             case Path():
-                return absolute(value)
+                return value if is_address(value) else absolute(value)
             case tuple():
                 return tuple(map(stable, value))
         return with_absolute_paths(value) if dataclasses.is_dataclass(value) else value

@@ -1,0 +1,142 @@
+"""Share a run's best policy: a folder with all that belongs to it, and its upload to the Hugging Face Hub."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+
+from saclab.errors import SettingError, require
+from saclab.files import replace_file, write_json
+from saclab.hub import require_name, require_token, upload
+from saclab.playback import evaluate, record
+from saclab.records import is_there, read_bytes
+from saclab.sharing.model_card import VIDEO, Card
+from saclab.sharing.private import public_description, public_result, require_no_paths
+from saclab.trained_policy import POLICY_BYTES, policy_folder
+from saclab.trained_policy import read_description as read_policy_description
+from saclab.training.run_folder import RunRecord, read_description, read_result, read_run
+
+CARD, ONNX = "README.md", "policy.onnx"
+RESULTS = ("config.json", "result.json", "evaluations.csv")
+FILM_STEPS, FILM_SIZE = 1000, 320
+"""Of a film that is made for sharing: an episode of most environments, in steps; pixels."""
+
+Tell = Callable[[str], None]
+
+
+def share(
+    run: Path,
+    repository: str,
+    folder: Path | None = None,
+    *,
+    private: bool = False,
+    license: str | None = None,
+    video: bool = False,
+    onnx: bool = False,
+    episodes: int = 20,
+    seed: int = 1_000_000,
+    imports: Sequence[str] = (),
+    paths_too: bool = False,
+    tell: Tell = print,
+) -> str:
+    """Put a run's best policy, its results and a model card on the Hugging Face Hub, or into a folder.
+
+    Args:
+        run: the run folder.
+        repository: user/name on the Hub, made if there is none.
+        folder: write there what would be sent, and send nothing.
+        private: make the repository so that only its owner sees it.
+        license: an identifier of the Hub's for the card, such as mit.
+        video: film an episode anew; else best/video.mp4 is taken if there is one.
+        onnx: add the policy as an ONNX file.
+        episodes: fresh ones, of which the card tells the score.
+        seed: of those episodes.
+        imports: packages that the run's environment may import.
+        paths_too: publish paths of this machine that the configuration holds.
+        tell: takes what is done, and what is sent before it is.
+
+    Returns:
+        Where it lies: the address of the page, or the folder.
+
+    Raises:
+        UserError: if there is no token, the Hub refuses or cannot be reached, the run has no policy, its configuration
+            names a path of this machine, or `folder` is not empty. Nothing has been sent then.
+    """
+    require(episodes >= 1, "episodes", episodes, "use at least 1")
+    require_name(repository)
+    require_fresh(folder) if folder is not None else require_token()
+    found = read_run(run)
+    if not paths_too:
+        require_no_paths(found.config.to_dict() | msgspec.to_builtins(read_policy_description(run)))
+    tell(f"evaluating the best policy on {episodes} fresh episodes …")
+    card = Card(repository, found, evaluate(run, episodes, seed, imports=imports), seed, imports, license)
+    with collected(run, card, video, onnx, tell) as files:
+        tell("\n".join(f"  {path.name:<20} {path.stat().st_size:>12,} bytes" for path in files.values()))
+        if folder is not None:
+            return str(written(files, folder))
+        tell(f"sending these to {repository}{', which only you will see' if private else ', for everybody to see'} …")
+        config = found.config
+        message = f"{config.variant} on {config.environment}, trained and shared by saclab"
+        return upload(repository, files, POLICY_BYTES.keys(), {VIDEO, ONNX, *RESULTS}, private, message)
+
+
+def require_fresh(folder: Path) -> None:
+    """Raise SettingError for a folder that holds something."""
+    if is_there(folder) and not (folder.is_dir() and not any(folder.iterdir())):
+        raise SettingError("folder", str(folder), "there is something already: name a new folder")
+
+
+@contextmanager
+def collected(run: Path, card: Card, video: bool, onnx: bool, tell: Tell) -> Iterator[dict[str, Path]]:
+    """All that is shared, by name, in a folder that is gone afterwards."""
+    with TemporaryDirectory(prefix="saclab-share-") as name:
+        folder = Path(name)
+        for file in POLICY_BYTES:
+            replace_file(folder / file, read_bytes(policy_folder(run) / file))
+        copy_results(run, card.run, folder)
+        add_film(run, folder, video, card, tell)
+        if onnx:
+            from saclab.onnx_export import export_onnx
+
+            export_onnx(folder, folder / ONNX)
+        names = [path.name for path in folder.iterdir()]
+        replace_file(folder / CARD, card.text(names).encode())
+        yield {file: folder / file for file in sorted([*names, CARD])}
+
+
+def copy_results(run: Path, found: RunRecord, folder: Path) -> None:
+    """The configuration, the evaluations and the result, without what tells of the machine."""
+    write_json(folder / "config.json", public_description(read_description(run, {})))
+    replace_file(folder / "evaluations.csv", read_bytes(run / "evaluations.csv"))
+    result = read_result(run)
+    if result is not None:
+        write_json(folder / "result.json", public_result(result))
+
+
+def add_film(run: Path, folder: Path, anew: bool, card: Card, tell: Tell) -> None:
+    """A film of the policy: a new one, or that in the run folder unless a better policy has been found since."""
+    best = policy_folder(run)
+    filmed = best / "video.mp4"
+    if anew:
+        tell("filming an episode …")
+        record(folder, folder / VIDEO, FILM_STEPS, card.seed, FILM_SIZE, card.imports)
+    elif is_there(filmed):
+        if filmed.stat().st_mtime < max((best / name).stat().st_mtime for name in POLICY_BYTES):
+            tell(f"{filmed} is older than the policy, and left out: --video films it anew")
+        else:
+            replace_file(folder / VIDEO, read_bytes(filmed))
+
+
+def written(files: dict[str, Path], folder: Path) -> Path:
+    """The folder with copies of these files."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, path in files.items():
+            replace_file(folder / name, path.read_bytes())
+    except OSError as error:
+        raise SettingError("folder", str(folder), f"{error.strerror or error}; name another") from error
+    return folder

@@ -36,6 +36,7 @@ from saclab.records import (
     FileRecord,
     Formatted,
     Missing,
+    Prefilled,
     Result,
     RunDescription,
     Session,
@@ -179,6 +180,8 @@ class RunRecord(NamedTuple):
     """The columns of Q_BIAS_COLUMNS; empty arrays if it was not measured."""
     result: dict[str, Any] | None
     """result.json of a finished run."""
+    prefill: Prefilled | None = None
+    """What the run began with, if with anything."""
 
 
 def read_run(run: Path) -> RunRecord:
@@ -213,6 +216,7 @@ def read_run(run: Path) -> RunRecord:
         metrics=table_from_json_lines(run / "metrics.jsonl", log("metrics.jsonl"), METRICS),
         q_bias=table_from_csv(run / "q_bias.csv", log("q_bias.csv"), Q_BIAS),
         result=None if result is None else msgspec.to_builtins(result),
+        prefill=description.prefill,
     )
 
 

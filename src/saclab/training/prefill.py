@@ -96,9 +96,10 @@ def begin_with(prefill: Prefill, run: RunState) -> np.ndarray:
             run.observation_moments.enter(np.asarray(run.layout.unpack(rows[first : first + PART]).observation))
     if run.reward_scale.active and len(rows):
         batch = run.layout.unpack(rows)
-        goes_on = np.all(batch.observation[1:] == batch.next_observation[:-1], axis=1) & (batch.terminated[:-1] == 0)
+        left = ~np.all(batch.observation[1:] == batch.next_observation[:-1], axis=1)
+        ended = (batch.terminated > 0) | np.append(left, False)
         rewards = np.asarray(batch.reward_terms @ reward_weights(run.config.algorithm))
-        run.reward_scale.enter_stream(rewards, np.append(~goes_on, True))
+        run.reward_scale.enter_stream(rewards, ended)
     in_place: np.ndarray = rows[side_by_side(len(rows), environments)]
     return in_place
 

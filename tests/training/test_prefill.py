@@ -17,9 +17,10 @@ from saclab.protocols import make_config
 from saclab.records import read_json
 from saclab.replay import ReplayBuffer, RowLayout, Windows
 from saclab.training import loop
-from saclab.training.checkpoint import newest_first, read_checkpoint
+from saclab.training.checkpoint import newest_first, read_checkpoint, save_checkpoint
 from saclab.training.events import Started
 from saclab.training.local_engine import LocalBuilder, LocalEngine
+from saclab.training.manifest import Moment
 from saclab.training.prefill import begin_with, read_prefill, side_by_side
 from saclab.training.run_folder import read_run
 from saclab.training.run_state import RunState
@@ -255,6 +256,26 @@ def test_a_run_without_a_whole_checkpoint_is_refused_and_left_alone(tmp_path):
         path.unlink()
     checkpoint.rmdir()
     assert "it has none: let that run go on until it saves" in refusal(config, own)
+
+
+def test_a_replay_with_what_is_not_finite_is_refused_with_its_place(tmp_path):
+    own, source = tmp_path / "own", tmp_path / "source"
+    config = small_config("Pendulum-v1", "sac")
+    stop_at(30, config, source)
+    buffer = ReplayBuffer(config.training.replay_capacity, RowLayout(3, 1))
+    checkpoint = read_checkpoint(newest_first(source / "checkpoints")[0], buffer)
+    buffer.rows[17, 2] = np.nan
+    save_checkpoint(source / "checkpoints", Moment(31), checkpoint, buffer)
+    assert "a number of transition 17 is not finite" in refusal(prefilled(f"replay:{source}"), own)
+
+
+def test_wrappers_that_the_data_have_not_gone_through_are_told_of():
+    config = prefilled(f"minari:{PENDULUM}", wrappers=("FlattenObservation", "RecordEpisodeStatistics"))
+    builder = LocalBuilder(config)
+    told = read_prefill(config, builder.spec, builder.layout).notes
+    assert (
+        told[1] == f"the data set {PENDULUM} is taken as it is: nothing in it has gone through RecordEpisodeStatistics"
+    )
 
 
 def test_a_run_that_has_to_begin_anew_begins_with_the_same_or_not_at_all(shelf, tmp_path):

@@ -97,7 +97,7 @@ def begin_with(prefill: Prefill, run: RunState) -> np.ndarray:
     if run.reward_scale.active and len(rows):
         batch = run.layout.unpack(rows)
         left = ~np.all(batch.observation[1:] == batch.next_observation[:-1], axis=1)
-        ended = (batch.terminated > 0) | np.append(left, False)
+        ended = np.asarray(batch.terminated > 0) | np.append(left, False)
         rewards = np.asarray(batch.reward_terms @ reward_weights(run.config.algorithm))
         run.reward_scale.enter_stream(rewards, ended)
     in_place: np.ndarray = rows[side_by_side(len(rows), environments)]

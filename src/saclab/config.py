@@ -42,7 +42,7 @@ class Config:
         )  # fmt: skip
         batch, training = self.algorithm.batch_size, self.training
         require(
-            batch <= training.random_steps,
+            batch <= training.random_steps or training.fills_replay,  # which is looked at when it is there
             "batch_size", batch,
             f"the first update would draw from a buffer of {training.random_steps} transitions: "
             f"use --batch-size {training.random_steps} or less, or --random-steps {batch} or more",

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from saclab.config import Config
 from saclab.errors import require, unknown_name
+from saclab.files import absolute
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names, replace_settings
 from saclab.variants import default_settings, needed_settings, task_name, variant_changes
+
+DATA_SET_PATHS = ("/", "./", "../", "~")
+"""How the name of a Minari data set begins that is the path of one; the others are ids."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +169,7 @@ def make_config(
         protocol=protocol,
         seed=seed,
         algorithm=replace_settings(default_settings(environment), algorithm),
-        training=TrainingSettings(**training),
+        training=with_stable_prefill(TrainingSettings(**training)),
         environment_arguments=dict(environment_arguments or {}),
     )
 
@@ -180,6 +185,14 @@ def own_config(
     """What `make_config` gives, with what the variant needs and is not given left empty: to compare a run with."""
     empty = dict.fromkeys(needed_settings(variant, environment), ())
     return make_config(environment, variant, protocol, seed, environment_arguments, {**empty, **(overrides or {})})
+
+
+def with_stable_prefill(training: TrainingSettings) -> TrainingSettings:
+    """Settings whose prefill means the same in any working directory: paths are absolute, ids stay as they are."""
+    kind, name = training.prefill_source or ("", "")
+    if not kind or (kind == "minari" and not name.startswith(DATA_SET_PATHS)):
+        return training
+    return dataclasses.replace(training, prefill=f"{kind}:{absolute(os.path.expanduser(name))}")
 
 
 def held_to(ceilings: Mapping[str, int], settings: Mapping[str, Any]) -> dict[str, Any]:

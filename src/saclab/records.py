@@ -75,13 +75,23 @@ class Formatted(Struct):
     format: int
 
 
-class RunDescription(Formatted):
+class Prefilled(Struct):
+    """What is recorded of the experience that a run has begun with."""
+
+    transitions: Count
+    """In the replay buffer before the first step; 0 where it is a policy."""
+    sha256: Sha256
+    """Of the transitions, or of the policy."""
+
+
+class RunDescription(Formatted, omit_defaults=True):
     """config.json."""
 
     config: dict[str, Any]
     """`Config.to_dict()`."""
     versions: dict[str, str]
     machine: dict[str, Any]
+    prefill: Prefilled | None = None
 
 
 class Machine(Struct):

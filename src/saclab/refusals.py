@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 from saclab.errors import require
 
 if TYPE_CHECKING:
-    from saclab.settings import AlgorithmSettings
+    from saclab.settings import AlgorithmSettings, TrainingSettings
 
 UPDATES = ("critic", "actor", "temperature", "targets")
 """The parts of an update."""
+PREFILLS = ("minari", "replay", "policy")
+"""Kinds of what a run can begin with."""
 
 
 def require_known(settings: AlgorithmSettings, choices: Mapping[str, tuple[str | None, ...]]) -> None:
@@ -135,4 +137,23 @@ def require_possible_critics(settings: AlgorithmSettings) -> None:
     require(
         settings.initialisation == "network" or not own,
         "initialisation", settings.initialisation, f"use network: {', '.join(sorted(own))} starts in a way of its own",
+    )  # fmt: skip
+
+
+def require_prefill(settings: TrainingSettings) -> None:
+    """Raise SettingError for a prefill that is none, or that cannot be together with the other settings."""
+    known = settings.prefill is None or isinstance(settings.prefill, str)
+    kind, name = (known and settings.prefill_source) or (None, "-")
+    require(
+        known and kind in (*PREFILLS, None) and bool(name.strip()) and name.isprintable(),
+        "prefill", settings.prefill, "write minari:DATASET-ID, replay:RUN-FOLDER or policy:RUN-FOLDER",
+    )  # fmt: skip
+    require(
+        settings.prefill_transitions is None or settings.fills_replay,
+        "prefill_transitions", settings.prefill_transitions,
+        f"use it with a prefill that holds transitions (minari:, replay:): it is {settings.prefill!r}",
+    )  # fmt: skip
+    require(
+        kind != "policy" or settings.random_steps >= 1,
+        "prefill", settings.prefill, "the policy acts in the random steps: use --random-steps 1 or more",
     )  # fmt: skip

@@ -130,7 +130,7 @@ class ReplayBuffer:
         self.rows = np.zeros((capacity, layout.width), np.float32)
         """f32[capacity, width]; row i holds transition number i, i + capacity, …"""
         self.added = 0
-        """Transitions added since the start of the run."""
+        """Transitions added since the start of the run, those that it began with counted in."""
 
     @property
     def capacity(self) -> int:
@@ -143,7 +143,10 @@ class ReplayBuffer:
 
     def add(self, transitions: Transitions) -> None:
         """Store N transitions in place of the oldest ones."""
-        rows = self.layout.pack(transitions)
+        self.add_rows(self.layout.pack(transitions))
+
+    def add_rows(self, rows: np.ndarray) -> None:
+        """Store packed transitions f32[N, width], at most `capacity`, in place of the oldest ones."""
         positions = np.arange(self.added, self.added + len(rows)) % self.capacity
         self.rows[positions] = rows
         self.added += len(rows)

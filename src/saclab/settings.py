@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, ge
 
 from saclab.errors import require, unknown_name
 from saclab.limits import require_representable
-from saclab.refusals import UPDATES, require_known, require_possible, require_ranges
+from saclab.refusals import UPDATES, require_known, require_possible, require_prefill, require_ranges
 from saclab.reward_schedule import ScheduledTerm, parse_schedule
 
 if TYPE_CHECKING:
@@ -203,6 +203,12 @@ class TrainingSettings:
     stepped while a round is computed, which saves time where there is more than one core."""
     replay_capacity: int = 1_000_000
     """Transitions that the replay buffer holds; the oldest is overwritten."""
+    prefill: str | None = None
+    """Where the experience comes from that a run begins with: minari:DATASET-ID or replay:RUN-FOLDER for the
+    transitions in the replay buffer before the first step, which are no steps of the run; policy:RUN-FOLDER for the
+    actions of the random steps, which that run's best policy then chooses."""
+    prefill_transitions: int | None = None
+    """The most transitions that are taken from a data set or a replay buffer: the newest. None: all that fit."""
 
     max_steps: int | None = None
     """Stop after so many environment steps."""
@@ -235,11 +241,12 @@ class TrainingSettings:
                     "evaluation_episodes", "log_interval")  # fmt: skip
         for name in positive:
             require(getattr(self, name) >= 1, name, getattr(self, name), "use a whole number of at least 1")
-        optional = ("max_steps", "max_updates", "max_episodes", "patience_episodes",
+        optional = ("max_steps", "max_updates", "max_episodes", "patience_episodes", "prefill_transitions",
                     "evaluation_interval_episodes", "evaluation_interval_steps")  # fmt: skip
         for name in optional:
             value = getattr(self, name)
             require(value is None or value >= 1, name, value, "use a whole number of at least 1, or leave it out")
+        require_prefill(self)
         require(self.acting_delay in (0, 1), "acting_delay", self.acting_delay, "use 0 or 1")
         for name in ("random_steps", "q_bias_episodes"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "use 0 or more")
@@ -253,6 +260,19 @@ class TrainingSettings:
             f"give exactly one of it and evaluation_interval_steps (now {self.evaluation_interval_steps}), "
             "and None for the other",
         )  # fmt: skip
+
+    @property
+    def prefill_source(self) -> tuple[str, str] | None:
+        """Kind and name of what the run begins with; None if it begins with nothing."""
+        if self.prefill is None:
+            return None
+        kind, _, name = self.prefill.partition(":")
+        return kind, name
+
+    @property
+    def fills_replay(self) -> bool:
+        """Whether there are transitions in the replay buffer before the first step."""
+        return self.prefill_source is not None and self.prefill_source[0] != "policy"
 
     @property
     def update_to_data_ratio(self) -> float:

@@ -35,6 +35,7 @@ class TrainedPolicy:
     """Acts in the environment's own units, on NumPy alone; `predict` has Stable-Baselines3's signature."""
 
     def __init__(self, settings: AlgorithmSettings, spec: EnvironmentSpec, parameters: np.ndarray, seed: int = 0):
+        self.settings = settings
         self.policy = make_policy(settings, spec.observation_size, spec.action_size)
         self.spec = spec
         self.parameters = parameters

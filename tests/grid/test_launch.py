@@ -69,6 +69,12 @@ def test_arguments_of_every_environment_are_tried(tmp_path: Path) -> None:
         require_startable(cells, 0, "--workers")
 
 
+def test_a_grid_is_not_begun_without_what_its_runs_begin_with(tmp_path: Path) -> None:
+    cells = make_grid(["Pendulum-v1"], ["sac"], "quick", 2, tmp_path, overrides={"prefill": "replay:/no/such/run"})
+    with pytest.raises(UserError, match="/no/such/run is not a run folder"):
+        require_startable(cells, 2, "--workers")
+
+
 def test_a_status_takes_in_what_a_worker_says(tmp_path: Path) -> None:
     status = RunStatus(grid(tmp_path)[0])
     status.enter({"event": "progress", "fraction": 0.25, "updates": 50, "episodes": 1, "steps": 150, "seconds": 1.0})

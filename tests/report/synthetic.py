@@ -38,6 +38,7 @@ def write_run(
     name: str | None = None,
     returns: list[float] | None = None,
     q_bias: bool = False,
+    prefill: dict[str, Any] | None = None,
 ) -> Path:
     """Write one run and return its folder; `returns` are the evaluation returns, else a noisy rise to about `level`.
 
@@ -52,6 +53,8 @@ def write_run(
         "versions": VERSIONS | (versions or {}),
         "machine": {"system": "Linux", "processor": "x86_64", "threads": 1},
     }
+    if prefill is not None:
+        content["prefill"] = prefill
     (folder / "config.json").write_text(json.dumps(content))
     generator = np.random.default_rng([seed, len(variant)])
     count = evaluations if returns is None else len(returns)

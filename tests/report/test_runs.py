@@ -49,6 +49,27 @@ def test_refuses_what_differs_and_names_it(tmp_path, change, named):
     assert str(runs[-1]) in str(refused.value)
 
 
+def begun(root, place: str, digit: str, seed: int):
+    """A run that began with a data set; `digit` is its content."""
+    return write_run(
+        root, seed=seed, overrides={"prefill": f"minari:/{place}"},
+        prefill={"transitions": 500, "sha256": digit * 64},
+    )  # fmt: skip
+
+
+def test_runs_that_began_with_other_data_are_not_comparable(tmp_path):
+    """It is the content that counts: a folder may have been copied to a machine where it lies elsewhere."""
+    same = [begun(tmp_path, place, "a", seed) for seed, place in enumerate(("here", "there"))]
+    assert len(read_comparison(same).runs) == 2
+    other = begun(tmp_path, "here", "b", 2)
+    with pytest.raises(UserError, match=r"prefill is 500 transitions, SHA-256 bbbbbbbbbbbbbbbb in .*SHA-256 aaaaaaa"):
+        read_comparison([*same, other])
+    with pytest.raises(UserError, match=r"prefill is .* and None in|prefill is None in"):
+        read_comparison([write_run(tmp_path, seed=3), *same])
+    labelled = read_comparison([write_run(tmp_path, seed=4), *same], allow_mixed=True)
+    assert sorted(len(group) for group in labelled.groups.values()) == [1, 2]
+
+
 def test_versions_that_do_not_change_the_task_are_no_reason(tmp_path):
     runs = [write_run(tmp_path, "sac", 0), write_run(tmp_path, "sac", 1, versions={"mujoco": "4.9.9", "jax": "9"})]
     assert len(read_comparison(runs).runs) == 2

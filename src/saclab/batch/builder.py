@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import jax
+import numpy as np
 
 from saclab.batch.engine import DeviceEngine
 from saclab.batch.program import Program
@@ -51,6 +52,11 @@ class DeviceBuilder:
         checkpoint = read_checkpoint(path, buffer)
         self.replay.load(run, buffer.rows)
         return checkpoint
+
+    def fill(self, run: int, rows: np.ndarray) -> None:
+        buffer = ReplayBuffer(self.replay.capacity, self.layout)
+        buffer.add_rows(rows)
+        self.replay.load(run, buffer.rows)
 
     def build(self, starts: Sequence[Start]) -> DeviceEngine:
         return DeviceEngine(starts, self.spec, self.program, self.replay, self.workers)

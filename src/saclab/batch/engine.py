@@ -60,6 +60,7 @@ class DeviceEngine:
         configs = [run.config for run in self.runs]
         self.training, self.batch_size = configs[0].training, configs[0].algorithm.batch_size
         self.steps, self.updates = self.runs[0].counters.steps, self.runs[0].counters.updates
+        self.prefilled = self.runs[0].prefilled
         self.active = list(range(len(starts)))
         self.numbers = self._put_stacked([numbers_of(config, replay.layout) for config in configs])
         self.reward_weights = self._put_stacked([run.reward_weights() for run in self.runs])
@@ -104,7 +105,7 @@ class DeviceEngine:
             if moved and should_pause():
                 return
             moved = True
-            rows, position = self.replay.newest(self.steps, self.training.parallel_environments)
+            rows, position = self.replay.newest(self.added, self.training.parallel_environments)
             self.experience = Experience(rows[: len(active)], position[: len(active)], self._draw(active))
 
     def drop(self, run: int) -> None:
@@ -159,7 +160,7 @@ class DeviceEngine:
         state = self.runs[run]
         late = self.training.acting_delay > 0
         behaviour = np.asarray(self.behaviour[run]) if late else self.actor(run)
-        replay = self.replay.slot(run, state.counters.steps)
+        replay = self.replay.slot(run, state.added)
         return Snapshot(state, self._learner(run), behaviour, self.pool.observation(run), replay)
 
     def capture_environments(self, run: int) -> EnvironmentStates:
@@ -191,21 +192,22 @@ class DeviceEngine:
         return own
 
     def _next_actions(self) -> np.ndarray:
-        """f32[R·E, A] in [-1, 1]: uniform during the random steps, then samples of the policies."""
+        """f32[R·E, A] in [-1, 1]: uniform or a guide's during the random steps, then samples of the policies."""
         if self.steps < self.training.random_steps:
             self.flush()
-            actions = self._of_active(lambda run: run.exploration.uniform_action())
+            seen = self.pool.observation
+            actions = self._of_active(lambda run: self.runs[run].exploring_action(seen(run)))
         else:
-            launched = self._launch(self._of_active(lambda run: run.exploration.noise()))
+            launched = self._launch(self._of_active(lambda run: self.runs[run].exploration.noise()))
             actions = np.asarray(launched)[: len(self.runs)]
         return actions.reshape(-1, self.spec.action_size)
 
-    def _of_active(self, draw_one: Callable[[RunState], np.ndarray]) -> np.ndarray:
+    def _of_active(self, draw_one: Callable[[int], np.ndarray]) -> np.ndarray:
         """f32[R, E, A], zero for runs that are not active."""
         shape = (len(self.runs), self.training.parallel_environments, self.spec.action_size)
         drawn = np.zeros(shape, np.float32)
         for run in self.active:
-            drawn[run] = draw_one(self.runs[run])
+            drawn[run] = draw_one(run)
         return drawn
 
     def _launch(self, noise: np.ndarray | None) -> jax.Array | None:
@@ -256,7 +258,7 @@ class DeviceEngine:
         """Keep the step's transitions, and draw the minibatches of the first updates due; None draws nothing."""
         training = self.training
         rows = self.pool.buffers.row.reshape(len(runs), training.parallel_environments, -1).copy()
-        before = self.steps - training.parallel_environments
+        before = self.added - training.parallel_environments
         position = np.full(len(runs), before % training.replay_capacity, np.int32)
         self._weigh_rewards()
         self._scale_rewards(rows, runs)
@@ -269,13 +271,18 @@ class DeviceEngine:
         end = first + end_of_part(self.updates - first, last - first, max(SHORTEST_PART, LONGEST_CALL // self.slots))
         drawn = np.zeros((len(runs), end - self.updates, self.batch_size), np.int32)
         self.updates = end
-        stored = min(self.steps, self.training.replay_capacity)
+        stored = min(self.added, self.training.replay_capacity)
         for place, run in enumerate(runs):
             if run is not None:
                 run.counters.steps, run.counters.updates = self.steps, self.updates
                 for rows in drawn[place]:
                     rows[:] = draw(run.sampling, stored, self.batch_size)
         return drawn
+
+    @property
+    def added(self) -> int:
+        """Transitions that have been put into each replay buffer."""
+        return self.prefilled + self.steps
 
     @property
     def _round_start(self) -> int:

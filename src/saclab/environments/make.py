@@ -44,6 +44,16 @@ class EnvironmentSpec:
             scaled = np.rint(scaled)
         return scaled.astype(self.action_low.dtype, copy=False)
 
+    def normalise_action(self, action: np.ndarray) -> np.ndarray:
+        """The inverse of `scale_action`: actions [..., A] between the environment's bounds as f32 in [-1, 1].
+
+        What lies outside the bounds is outside [-1, 1]; where there is one action only, it is 0.
+        """
+        middle, half_range = (np.asarray(part, np.float64) for part in self._middle_and_half_range)
+        scale = np.where(half_range > 0, half_range, 1.0)
+        normalised: np.ndarray = (np.asarray(action, np.float64) - middle) / scale
+        return np.where(half_range > 0, normalised, 0.0).astype(np.float32)
+
     @cached_property
     def _middle_and_half_range(self) -> tuple[np.ndarray, np.ndarray]:
         low, high = self.action_low, self.action_high

@@ -116,19 +116,43 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
     from saclab.replay import layout_of
     from saclab.training.starts import require_same_config
 
-    specs: dict[tuple[str, str], EnvironmentSpec] = {}
+    specs: dict[str, EnvironmentSpec] = {}
     needed: dict[int, tuple[Config, RowLayout]] = {}
     for cell in cells:
         config = cell.config
         if (cell.folder / "config.json").exists():
             require_same_config(cell.folder, config)
-        wrappers = config.training.wrappers
-        key = config.environment, json.dumps([config.environment_arguments, wrappers], sort_keys=True, default=repr)
-        if key not in specs:
-            environment = CheckedEnvironment(config.environment, config.environment_arguments, wrappers=wrappers)
+        if (key := environment_key(config)) not in specs:
+            environment = CheckedEnvironment(
+                config.environment, config.environment_arguments, wrappers=config.training.wrappers
+            )
             specs[key] = environment.spec
             environment.close()
         layout = layout_of(specs[key], config.algorithm)
         needed[sum(needed_memory(config, layout))] = config, layout
     if at_once:
         require_memory(*needed[max(needed)], at_once, fewer)
+        require_prefill_there(cells, specs)
+
+
+def require_prefill_there(cells: Sequence[Cell], specs: Mapping[str, EnvironmentSpec]) -> None:
+    """Raise UserError if what runs are to begin with cannot be read here; `specs` are by `environment_key`."""
+    from saclab.replay import layout_of
+    from saclab.training.manifest import visible_checkpoints
+    from saclab.training.prefill import read_prefill
+
+    looked_at = set()
+    for cell in cells:
+        if cell.config.training.prefill is None or cell.finished or visible_checkpoints(cell.folder / "checkpoints"):
+            continue
+        spec, settings = specs[environment_key(cell.config)], cell.config.algorithm
+        kind = environment_key(cell.config), settings.terms_of_reward, settings.batch_size, cell.config.training
+        if kind not in looked_at:
+            read_prefill(cell.config, spec, layout_of(spec, settings))
+            looked_at.add(kind)
+
+
+def environment_key(config: Config) -> str:
+    """The same for all runs of one environment with the same arguments and wrappers."""
+    what = [config.environment, config.environment_arguments, config.training.wrappers]
+    return json.dumps(what, sort_keys=True, default=repr)

@@ -99,7 +99,16 @@ def conditions(run: RunRecord) -> dict[str, Any]:
         "environment_arguments": run.config.environment_arguments,
         **{name: OWN if name in unchanged and value == unchanged[name] else value
            for name, value in training.items() if name not in ONLY_MEASURING},
+        **prefill_told(run),
     }  # fmt: skip
+
+
+def prefill_told(run: RunRecord) -> dict[str, str]:
+    """What a run began with, by its content, in place of the setting's text: its place may be another one elsewhere."""
+    if run.prefill is None:
+        return {}
+    what = f"{run.prefill.transitions} transitions" if run.prefill.transitions else "a policy"
+    return {"prefill": f"{what}, SHA-256 {run.prefill.sha256[:16]}"}
 
 
 def own_training(config: Config) -> TrainingSettings | None:

@@ -105,7 +105,7 @@ class Engine(Protocol):
 class EngineBuilder(Protocol):
     """What an engine will be made of: all that can be refused is refused before a run folder is touched.
 
-    It builds one engine, with the replay buffers into which it has read checkpoints before.
+    It builds one engine, with the replay buffers into which it has read checkpoints, or filled them, before.
     """
 
     @property
@@ -127,6 +127,9 @@ class EngineBuilder(Protocol):
         Raises:
             CheckpointError: if it is not whole.
         """
+
+    def fill(self, run: int, rows: np.ndarray) -> None:
+        """Put packed transitions f32[M, width] into the replay buffer of a run, which is empty."""
 
     def build(self, starts: Sequence[Start]) -> Engine:
         """The engine of these runs.

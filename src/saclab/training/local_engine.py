@@ -48,6 +48,9 @@ class LocalBuilder:
     def read(self, run: int, path: Path) -> Checkpoint:
         return read_checkpoint(path, self.replay)
 
+    def fill(self, run: int, rows: np.ndarray) -> None:
+        self.replay.add_rows(rows)
+
     def build(self, starts: Sequence[Start]) -> LocalEngine:
         return LocalEngine(starts[0], self.replay)
 
@@ -131,9 +134,9 @@ class LocalEngine:
         return self.replay.sample_windows(run.sampling, settings.batch_size, windows)
 
     def _next_action(self) -> np.ndarray:
-        """f32[N, A] in [-1, 1]: uniform during the random steps, then a sample of the policy."""
+        """f32[N, A] in [-1, 1]: uniform or a guide's during the random steps, then a sample of the policy."""
         if self.run.exploring():
-            return self.run.exploration.uniform_action()
+            return self.run.exploring_action(self.environments.observation)
         noise = self.run.exploration.noise()
         action: np.ndarray = self.policy.act(self.behaviour, self.environments.observation, noise)
         return action

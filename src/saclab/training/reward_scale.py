@@ -58,6 +58,18 @@ class RewardScale:
         self.moments = np.array(merged(count, mean, variance, self.returns))
         self.largest = np.maximum(self.largest, np.abs(self.returns).max())
 
+    def enter_stream(self, rewards: np.ndarray, ended: np.ndarray) -> None:
+        """Take in the rewards f32[M] of steps that one environment took in turn, and whether each ended an episode."""
+        if not self.active:
+            return
+        running, returns = 0.0, np.zeros(len(rewards))
+        for step, (reward, last) in enumerate(zip(rewards.tolist(), ended.tolist(), strict=True)):
+            running = reward if last else self.discount * running + reward
+            returns[step] = running
+        count, mean, variance = self.moments
+        self.moments = np.array(merged(count, mean, variance, returns))
+        self.largest = np.maximum(self.largest, np.abs(returns).max())
+
     @property
     def active(self) -> bool:
         """Whether rewards are divided by anything but 1."""

@@ -38,6 +38,7 @@ from saclab.records import (
     FileRecord,
     Formatted,
     Missing,
+    Prefilled,
     Result,
     RunDescription,
     Session,
@@ -183,6 +184,8 @@ class RunRecord(NamedTuple):
     """result.json of a finished run."""
     reward_terms: dict[str, np.ndarray] = {}  # noqa: RUF012 - read only
     """The columns of `reward_term_columns`; empty for a run whose reward is not split."""
+    prefill: Prefilled | None = None
+    """What the run began with, if with anything."""
 
 
 def read_run(run: Path) -> RunRecord:
@@ -218,6 +221,7 @@ def read_run(run: Path) -> RunRecord:
         q_bias=table_from_csv(run / "q_bias.csv", log("q_bias.csv"), Q_BIAS),
         result=None if result is None else msgspec.to_builtins(result),
         reward_terms=table_from_csv(run / OF_TERMS, log(OF_TERMS), REWARD_TERMS),
+        prefill=description.prefill,
     )
 
 

@@ -14,6 +14,7 @@ from saclab.replay import RowLayout
 from saclab.training import seeds
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.exploration import Exploration
+from saclab.training.guide import Guide
 from saclab.training.manifest import Moment
 from saclab.training.observation_moments import ObservationMoments
 from saclab.training.reward_scale import RewardScale
@@ -29,7 +30,7 @@ class RunState:
 
     def __init__(self, config: Config, layout: RowLayout) -> None:
         """The state before the first step."""
-        self.config = config
+        self.config, self.layout = config, layout
         algorithm, environments = config.algorithm, config.training.parallel_environments
         self.exploration = Exploration(config.seed, environments, layout.action_size, algorithm.longest_noise)
         self.reward_scale = RewardScale(
@@ -40,6 +41,10 @@ class RunState:
         """Names of what an update reports."""
         self.sampling = seeds.generator(config.seed, "replay")
         self.counters = Counters()
+        self.prefilled = 0
+        """Transitions that were in the replay buffer before the first step."""
+        self.guide: Guide | None = None
+        """Acts in the random steps, if there is one."""
         self.window: list[Any] = []
         """Metrics f32[M] of each update since the last line of metrics.jsonl, once the engine has delivered them."""
         self.logged_updates = 0
@@ -52,6 +57,17 @@ class RunState:
     def exploring(self) -> bool:
         """Whether the next step is one of the random ones."""
         return self.counters.steps < self.config.training.random_steps
+
+    def exploring_action(self, observation: np.ndarray) -> np.ndarray:
+        """f32[N, A] in [-1, 1] for a random step from f32[N, O]: uniform, or a sample of the guide's policy."""
+        if self.guide is None:
+            return self.exploration.uniform_action()
+        return self.guide.act(observation, self.exploration.noise())
+
+    @property
+    def added(self) -> int:
+        """Transitions that have been put into the replay buffer."""
+        return self.prefilled + self.counters.steps
 
     def restart_seeds(self) -> list[int]:
         """A seed for each environment that has to start anew at this step, never used before."""

@@ -84,6 +84,10 @@ class SavedState(Struct):
     sampling: GeneratorState
     logs: Files = {}
     facts: MachineFacts | None = None
+    prefilled: Count = 0
+    """Transitions that were in the replay buffer before the first step."""
+    guide: dict[str, Any] | None = None
+    """AlgorithmSettings of the policy that acts in the random steps, as long as they last, if there is one."""
 
 
 def read_state(state: Mapping[str, Any]) -> SavedState:

@@ -13,6 +13,7 @@ from saclab.config import Config
 from saclab.replay import RowLayout
 from saclab.training.captured import join_arrays, require_like, restore_generator, split_arrays
 from saclab.training.checkpoint import Arrays, Checkpoint, Replay
+from saclab.training.guide import guide_from
 from saclab.training.learners import finite_arrays, initial_learner, learner_from
 from saclab.training.manifest import CheckpointError
 from saclab.training.run_state import RunState
@@ -88,10 +89,13 @@ def to_checkpoint(
     noise, groups["exploration"] = run.exploration.capture()
     groups["rewards"] = run.reward_scale.capture()
     groups["observations"] = run.observation_moments.capture()
+    guide = None
+    if run.guide is not None and run.exploring():
+        guide, groups["guide"] = run.guide.capture()
     state = SavedState(
         run.counters, environment_states, msgspec.convert(noise, GeneratorState),
         msgspec.convert(run.sampling.bit_generator.state, GeneratorState), logs or {},
-        None if facts is None else MachineFacts(**facts),
+        None if facts is None else MachineFacts(**facts), run.prefilled, guide,
     )  # fmt: skip
     groups = {name: arrays for name, arrays in groups.items() if arrays}
     return Checkpoint(groups, msgspec.to_builtins(state), snapshot.replay.added)
@@ -116,8 +120,11 @@ def from_checkpoint(config: Config, layout: RowLayout, checkpoint: Checkpoint) -
         run.best_actor = require_like("best", groups["best"].get("actor"), np.asarray(example.actor.weights))
     run.counters = state.counters
     run.logged_updates = run.counters.updates - len(run.window)
-    if run.counters.steps != checkpoint.transitions:
-        raise CheckpointError(f"the checkpoint has {run.counters.steps} steps and {checkpoint.transitions} transitions")
+    run.prefilled = state.prefilled
+    if run.added != checkpoint.transitions:
+        raise CheckpointError(f"the checkpoint has {run.added} steps and {checkpoint.transitions} transitions")
+    if state.guide is not None:
+        run.guide = guide_from(state.guide, groups.get("guide", {}), layout)
     run.exploration.restore(msgspec.to_builtins(state.exploration), groups.get("exploration", {}))
     run.reward_scale.restore(groups.get("rewards", {}))
     run.observation_moments.restore(groups.get("observations", {}))

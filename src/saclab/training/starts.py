@@ -12,13 +12,14 @@ from saclab.config import Config
 from saclab.errors import UserError
 from saclab.files import write_json
 from saclab.machine import different_facts, other_simulation
-from saclab.records import FileRecord, RunDescription
+from saclab.records import FileRecord, Prefilled, RunDescription, read_json
 from saclab.replay import RowLayout
 from saclab.training.checkpoint import Checkpoint
 from saclab.training.common_checkpoint import read_common
 from saclab.training.engine import Engine, EngineBuilder, EnvironmentStateError
 from saclab.training.manifest import FORMAT as CHECKPOINT_FORMAT
 from saclab.training.manifest import CheckpointError
+from saclab.training.prefill import Prefill, begin_with, read_prefill
 from saclab.training.run_folder import FORMAT, read_config
 from saclab.training.saved_state import files_in, read_state
 from saclab.training.snapshot import Start, from_checkpoint, new_start
@@ -46,29 +47,53 @@ def find_beginnings(builder: EngineBuilder, folders: Sequence[Path], facts: dict
         UserError: if a folder holds a run with other settings.
         CheckpointError: if there are checkpoints and none can be used.
     """
-    layout = builder.layout
-    begun = [begin_folder(folder, config, facts) for folder, config in zip(folders, builder.configs, strict=True)]
-    notes = [[ratio_note(config)] for config in builder.configs]
+    layout, configs = builder.layout, builder.configs
+    begun = [is_begun(folder, config) for folder, config in zip(folders, configs, strict=True)]
+    notes = [[ratio_note(config)] for config in configs]
     found: list[Checkpoint] = []
     if any(begun):
         found = read_common([folder / "checkpoints" for folder in folders], builder.read, [own.append for own in notes])
     if not found:
-        return [
-            Beginning(new_start(config, layout), None, own) for config, own in zip(builder.configs, notes, strict=True)
-        ]
+        prefill = read_prefill(configs[0], builder.spec, layout)  # which the runs of an engine have in common
+        for folder, config in zip(folders, configs, strict=True):
+            begin_folder(folder, config, facts, prefill)
+        return [begun_with(prefill, builder, run, own) for run, own in enumerate(notes)]
     return [
         continued(config, folder, layout, checkpoint, own, facts)
-        for config, folder, checkpoint, own in zip(builder.configs, folders, found, notes, strict=True)
+        for config, folder, checkpoint, own in zip(configs, folders, found, notes, strict=True)
     ]
 
 
-def begin_folder(folder: Path, config: Config, facts: dict[str, Any]) -> bool:
-    """Write config.json; whether it was there, in which case it has to be that of the same run."""
-    if (folder / "config.json").exists():
+def is_begun(folder: Path, config: Config) -> bool:
+    """Whether there is a config.json, which has to be that of the same run."""
+    if begun := (folder / "config.json").exists():
         require_same_config(folder, config)
-        return True
-    write_json(folder / "config.json", RunDescription(FORMAT, config.to_dict(), **facts))
-    return False
+    return begun
+
+
+def begin_folder(folder: Path, config: Config, facts: dict[str, Any], prefill: Prefill | None) -> None:
+    """Write config.json; if it is there, the run had no checkpoint yet, and has to begin with the same again."""
+    path, record = folder / "config.json", None if prefill is None else prefill.record
+    if not path.exists():
+        write_json(path, RunDescription(FORMAT, config.to_dict(), **facts, prefill=record))
+    elif (before := read_json(path, RunDescription).prefill) != record:
+        raise UserError(
+            f"{folder} has begun with another prefill {config.training.prefill!r}: it had {told(before)} then, and "
+            f"has {told(record)} now: bring back what it was, or give this run a name of its own with --name"
+        )
+
+
+def told(record: Prefilled | None) -> str:
+    return "none" if record is None else f"{record.transitions} transitions with the SHA-256 {record.sha256[:12]}…"
+
+
+def begun_with(prefill: Prefill | None, builder: EngineBuilder, run: int, notes: list[str]) -> Beginning:
+    """A run of a builder before its first step."""
+    start = new_start(builder.configs[run], builder.layout)
+    if prefill is not None:
+        builder.fill(run, begin_with(prefill, start.run))
+        notes += prefill.notes
+    return Beginning(start, None, notes)
 
 
 def continued(

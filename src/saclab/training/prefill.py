@@ -151,7 +151,8 @@ def read_replay(config: Config, layout: RowLayout, folder: Path) -> Experience:
     Raises:
         UserError: if it is no run's folder, has no checkpoint, or its transitions do not fit.
     """
-    theirs, mine = read_config(folder).algorithm.terms_of_reward, config.algorithm.terms_of_reward
+    other = read_config(folder)
+    theirs, mine = other.algorithm.terms_of_reward, config.algorithm.terms_of_reward
     require(
         theirs == mine, "prefill", config.training.prefill, f"its reward_terms are {theirs}, and this run's are {mine}"
     )

@@ -12,7 +12,7 @@ import saclab
 from saclab.environments.make import EnvironmentSpec
 from saclab.errors import UserError
 from saclab.protocols import make_config
-from saclab.trained_policy import TrainedPolicy, load_policy, save_policy
+from saclab.trained_policy import TrainedPolicy, load_policy, policy_folder, save_policy
 from saclab.training.evaluation import Evaluator
 
 SIZES = {"hidden_layers": (16, 16), "batch_size": 32, "random_steps": 100}
@@ -90,3 +90,11 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
         load_policy(tmp_path / "elsewhere")
     with pytest.raises(UserError, match="holds no policy yet"):
         load_policy(tmp_path)
+
+
+def test_a_folder_that_holds_a_policy_is_used_whatever_lies_in_its_best(tmp_path: Path) -> None:
+    (tmp_path / "best").mkdir()
+    assert policy_folder(tmp_path) == tmp_path / "best"
+    (tmp_path / "policy.json").write_text("{}")
+    (tmp_path / "best" / "video.mp4").touch()
+    assert policy_folder(tmp_path) == tmp_path

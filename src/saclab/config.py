@@ -44,8 +44,9 @@ class Config:
         require(
             batch <= training.random_steps or training.fills_replay,  # which is looked at when it is there
             "batch_size", batch,
-            f"the first update would draw from a buffer of {training.random_steps} transitions: "
-            f"use --batch-size {training.random_steps} or less, or --random-steps {batch} or more",
+            f"the first update would draw from a buffer of {training.random_steps} transitions: use "
+            + f"--batch-size {training.random_steps} or less, or " * (training.random_steps > 0)
+            + f"--random-steps {batch} or more",
         )  # fmt: skip
         require(
             batch <= training.replay_capacity,

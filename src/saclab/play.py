@@ -16,8 +16,8 @@ from gymnasium.error import DependencyNotInstalled
 
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.wrappers import require_import_allowed
-from saclab.errors import RunBroken, UserError, in_words
-from saclab.playback import for_tracebacks, require_fit, require_seed
+from saclab.errors import RunBroken, UserError
+from saclab.playback import NEEDS_PYGAME, for_tracebacks, require_fit, require_seed
 from saclab.trained_policy import TrainedPolicy, load_policy, on_disk, read_description
 from saclab.training.failure import tell_of_closing, tracebacks_in
 
@@ -88,7 +88,7 @@ def require_window(environment: CheckedEnvironment, seed: int) -> None:
         environment.render()
     except RunBroken as error:
         if isinstance(error.__cause__, DependencyNotInstalled):  # of pygame, which only windows need
-            raise UserError(f"{name} cannot be shown here: {in_words(error.__cause__)}") from error
+            raise UserError(f"{name} cannot be shown here: {NEEDS_PYGAME}") from error
         refused = UserError(f"{name} cannot be shown here: {error}; film it: saclab record")
         refused.traceback = error.traceback
         raise refused from error

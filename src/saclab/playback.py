@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.make import EnvironmentSpec
@@ -21,6 +22,8 @@ from saclab.records import PolicyDescription
 from saclab.trained_policy import TrainedPolicy, load_policy, on_disk, read_description
 from saclab.training.evaluation import Evaluator
 from saclab.training.failure import tell_of_closing, tracebacks_in
+
+NEEDS_PYGAME = "it draws with pygame: pip install pygame"
 
 
 class EvaluationResult(NamedTuple):
@@ -145,9 +148,11 @@ def film_to(
     try:
         with imageio.get_writer(partial, **options) as writer:
             filmed = film(environment, policy, writer, steps, seed)
+        partial.replace(video)
     except ValueError as error:
         raise UserError(f"video = {str(video)!r}: {error}; use a name that ends in .mp4 or .gif") from error
-    partial.replace(video)
+    finally:
+        partial.unlink(missing_ok=True)
     return filmed
 
 
@@ -170,6 +175,8 @@ def require_rendering(environment: CheckedEnvironment) -> None:
     try:
         frame = environment.render()
     except RunBroken as error:  # renderers fail in ways of their own: a missing library, package, display or driver
+        if isinstance(error.__cause__, DependencyNotInstalled):
+            raise UserError(f"{environment.name} cannot be filmed here: {NEEDS_PYGAME}") from error
         refused = UserError(
             f"{environment.name} cannot be filmed here: {error}; without a screen MuJoCo needs EGL (Debian: libegl1 "
             "and libgl1-mesa-dri) and MUJOCO_GL=egl"

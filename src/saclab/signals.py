@@ -138,3 +138,14 @@ def how_it_ended(code: int, errors: str) -> str:
     how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
     last_words = [line.strip() for line in errors.splitlines() if line.strip()][-1:]
     return ": ".join([how, *last_words])
+
+
+def end_at_once_on_ctrl_c() -> None:
+    """Let Ctrl-C end this process, which has nothing to save; a KeyboardInterrupt can be lost in JAX's callbacks."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        os.write(2, b"saclab: interrupted\n")
+        os._exit(EXIT_STATUS[signal.SIGINT])
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, end)

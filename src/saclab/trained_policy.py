@@ -111,8 +111,8 @@ def on_disk(run: Path | str) -> Path:
 
 
 def policy_folder(run: Path) -> Path:
-    """Where the policy of a run lies: `best` in a run folder, or the folder itself."""
-    return run / "best" if is_folder(run / "best") else run
+    """Where the policy of a run lies: `best` in a run folder, or the folder itself if it holds one."""
+    return run if is_there(run / DESCRIPTION) or not is_folder(run / "best") else run / "best"
 
 
 def is_folder(path: Path) -> bool:

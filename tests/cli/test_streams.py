@@ -157,3 +157,19 @@ def test_training_on_a_plain_terminal_sends_no_escapes(tmp_path, words, variable
     assert status == 0, seen
     assert b"finished" in seen
     assert ESCAPE not in seen
+
+
+def test_ctrl_c_is_not_lost_where_there_is_nothing_to_save() -> None:
+    """A KeyboardInterrupt that is raised in a callback is ignored by Python; this is none."""
+    program = (
+        "import os, signal, weakref\n"
+        "from saclab.signals import end_at_once_on_ctrl_c\n"
+        "end_at_once_on_ctrl_c()\n"
+        "class Thing: pass\n"
+        "thing = Thing()\n"
+        "reference = weakref.ref(thing, lambda _: os.kill(os.getpid(), signal.SIGINT))\n"
+        "del thing\n"
+        "print('went on')\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "saclab: interrupted\n")

@@ -150,5 +150,5 @@ def test_a_server_that_does_not_answer_is_named(mlflow: Any, monkeypatch: pytest
 
 
 def test_a_missing_extra_says_how_to_install_it() -> None:
-    with pytest.raises(UserError, match=r"--thing needs .*pip install 'saclab\[thing\]'"):
+    with pytest.raises(UserError, match=r"--thing needs .*pip install '\.\[thing\]'"):
         required("no_such_package_for_sure", "thing", "--thing")

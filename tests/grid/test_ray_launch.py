@@ -211,7 +211,7 @@ def test_settings_of_ray_are_refused_where_they_cannot_work():
 
 def test_without_the_package_compare_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"--launcher ray .*pip install 'saclab\[ray\]'"):
+    with pytest.raises(UserError, match=r"--launcher ray .*pip install '\.\[ray\]'"):
         api.compare(["Pendulum-v1"], ["sac"], 1, "quick", runs=tmp_path, launcher="ray")
     assert not list(tmp_path.iterdir())
 

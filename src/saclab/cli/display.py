@@ -169,22 +169,24 @@ def show_tune(stream: Iterable[Tune], console: Console) -> Tune:
     """Show a tune until its end: a line for each trial that ends, the runs under way on a terminal; its last state."""
     from saclab.tuning.text import beginning, trial_line
 
-    told, warned, last_line, state = -1, dict[Path, int](), time.monotonic(), None
+    told, warned, last_line, state = set[int](), dict[Path, int](), time.monotonic(), None
+    begun = False
     with Live(console=console, refresh_per_second=4, transient=True, auto_refresh=console.is_terminal) as live:
         for state in stream:
-            if told < 0:
-                told = state.ended_before
+            if not begun:
+                begun = True
                 console.print(beginning(state), markup=False, highlight=False, soft_wrap=True)
-            for trial in state.ended[told:]:
-                console.print(trial_line(trial, state.plan), markup=False, highlight=False, soft_wrap=True)
-            told = len(state.ended)
+            for trial in state.ended:
+                if trial.number not in told | state.ended_before:
+                    told.add(trial.number)
+                    console.print(trial_line(trial, state.plan), markup=False, highlight=False, soft_wrap=True)
             runs = [run for trial in state.open for run in trial.runs]
             tell_warnings(runs, warned, console)
             if console.is_terminal:
                 live.update(grid_table(runs, rows=max(5, console.height - 6)))
             elif time.monotonic() - last_line > PLAIN_SECONDS:
                 last_line = time.monotonic()
-                console.print(f"{told} of {state.trials} trials ended | {grid_line(runs)}", soft_wrap=True)
+                console.print(f"{len(state.ended)} of {state.trials} trials ended | {grid_line(runs)}", soft_wrap=True)
     assert state is not None
     return state
 
@@ -193,9 +195,12 @@ def show_tuned(result: Tuned, console: Console) -> int:
     """Say what a tune has found, and where its page lies; the exit status."""
     if result.best is not None:
         own = "" if result.own_value is None else f", against {result.own_value:.4g} of the variant's own settings"
-        console.print(f"best: {result.value:.4g}{own}; judge it on seeds that no trial had:", soft_wrap=True)
+        told = f"best: {result.value:.4g}{own}; judge it on seeds that no trial had:"
+        console.print(told if result.commands else "nothing better than the variant's own settings was found")
         for words in result.commands:
             console.print(f"  {shlex.join(words)}", markup=False, highlight=False, soft_wrap=True)
+    elif result.trials:
+        console.print("no trial has come to its end, or to the score with all of its runs")
     if result.page is not None:
         console.print(f"page: {result.page}", markup=False, soft_wrap=True)
     for number, why in result.hindered.items():

@@ -41,9 +41,11 @@ class Evaluate:
     def __call__(self, console: Console) -> int:
         from saclab import playback
         from saclab.environments.foreign import prints_apart
+        from saclab.signals import end_at_once_on_ctrl_c
 
         if self.episodes < 1:
             raise SettingError("episodes", self.episodes, "use at least 1")
+        end_at_once_on_ctrl_c()
         with prints_apart():  # what is told is alone on standard output
             result = playback.evaluate(self.run, self.episodes, self.seed, not self.stochastic, self.imports)
         console.print(json.dumps(result._asdict()) if self.json else result.sentence(), soft_wrap=True, highlight=False)
@@ -55,10 +57,10 @@ class Record:
     """Film a run's best policy; needs no screen."""
 
     run: Positional[Path]
-    """The run folder, or hf:user/name[@revision] of the Hugging Face Hub."""
+    """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     video: Path | None = None
-    """File to write, .mp4 or .gif; None for best/video.mp4 in the run folder, where the report finds it, or for
-    name.mp4 here if the policy is the Hub's."""
+    """File to write, .mp4 or .gif; None for video.mp4 beside the policy, where the report finds it, or for name.mp4
+    here if the policy is the Hub's."""
     steps: int = 300
     """Environment steps to film at most."""
     seed: int = 1_000_000
@@ -70,8 +72,9 @@ class Record:
 
     def __call__(self, console: Console) -> int:
         from saclab import playback
+        from saclab.trained_policy import policy_folder
 
-        path = self.video or beside(self.run, "mp4") or self.run / "best" / "video.mp4"
+        path = self.video or beside(self.run, "mp4") or policy_folder(self.run) / "video.mp4"
         told = playback.record(self.run, path, self.steps, self.seed, self.size, self.imports)
         console.print(told, soft_wrap=True, markup=False)
         return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -131,6 +132,10 @@ class WeightsAndBiases:
         self.run.finish()
 
 
+PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}
+"""MLflow's own are minutes of silence before a server that does not answer is told of."""
+
+
 class MLflow:
     """A run of an MLflow experiment; its id lies in the run folder, so that a resumed run goes on there.
 
@@ -147,6 +152,8 @@ class MLflow:
         Raises:
             UserError: if the extra is not installed, or MLflow cannot be reached or used.
         """
+        for name, value in PATIENCE.items():
+            os.environ.setdefault(name, value)
         self.mlflow: Any = required("mlflow", "mlflow", "--mlflow")
         self.config = config
         try:

@@ -50,6 +50,11 @@ class Tracking:
     """Send the run to this experiment of MLflow, at MLFLOW_TRACKING_URI, or else in ./mlflow.db; needs the extra
     `mlflow`."""
 
+    @property
+    def any(self) -> bool:
+        """Whether one is asked for."""
+        return self.tensorboard or self.wandb is not None or self.mlflow is not None
+
     def trackers(self, config: Config, folder: Path) -> list[Tracker]:
         """Those that were asked for, of a run; raises UserError if an extra is not installed."""
         from saclab.cli import trackers
@@ -260,7 +265,8 @@ def train_and_show(
 
     finished = is_finished(folder)
     if finished:
-        console.print(f"{folder} is finished already; its results are kept", soft_wrap=True, markup=False)
+        untold = "; nothing is sent to a tracker" if tracking.any else ""
+        console.print(f"{folder} is finished already; its results are kept{untold}", soft_wrap=True, markup=False)
     with requests_from_signals(process_ends=True) as requests:
         stream: Iterable[Event] = train(config, folder, requests, checkpoint_minutes)
         for tracker in [] if finished else tracking.trackers(config, folder):

@@ -117,7 +117,7 @@ def making(environment: str, arguments: Mapping[str, Any]) -> Iterator[None]:
         raise unknown_environment(environment) from error
     except (gymnasium.error.Error, ImportError) as error:
         raise UserError(f"environment = {environment!r}: {in_words(error)}") from error
-    except UserError:
+    except (UserError, GeneratorExit):
         raise
     except BaseException as error:
         if meant_for_saclab(error):

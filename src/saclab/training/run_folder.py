@@ -188,13 +188,14 @@ class RunRecord(NamedTuple):
     """What the run began with, if with anything."""
 
 
-def read_run(run: Path) -> RunRecord:
+def read_run(run: Path | str) -> RunRecord:
     """Read a run folder, finished or not.
 
     Raises:
         UserError: if it is not one, or a file in it is damaged: what was recorded of the logs, and what follows from
             other numbers, is compared.
     """
+    run = Path(run)
     result = read_result(run)
     recorded = recorded_files(run, result)
     description = read_description(run, recorded)

@@ -9,7 +9,8 @@ from saclab.errors import UserError
 from saclab.grid.tasks import RunStatus
 from saclab.training.run_folder import read_evaluations
 from saclab.tuning.objective import Evaluations, Objective
-from saclab.tuning.study import best_trial
+from saclab.tuning.plan import TunePlan
+from saclab.tuning.study import best_trial, reached_score
 
 if TYPE_CHECKING:
     import optuna
@@ -83,24 +84,26 @@ class OpenTrial:
         """What a whole trial is worth."""
         return objective.value([found for found in self.evaluations if found is not None])
 
-    def hopeless(self, objective: Objective, study: optuna.Study) -> str:
+    def hopeless(self, plan: TunePlan, study: optuna.Study) -> str:
         """Why the trial is to be given up by its evaluations; empty if it is not.
 
         Every evaluation is judged by itself, so that the answer is the same however many have come since the last look.
         """
-        return self._too_slow(objective, study) if objective.kind.to_score else self._too_low(objective, study)
+        objective, best = plan.objective, best_trial(study)
+        if not objective.kind.to_score:
+            return self._too_low(objective, study)
+        return self._too_slow(objective, best.value) if best is not None and reached_score(best, plan) else ""
 
-    def _too_slow(self, objective: Objective, study: optuna.Study) -> str:
-        """Whether more has been spent on the way to the score than the best trial needed."""
+    def _too_slow(self, objective: Objective, best: float | None) -> str:
+        """Whether more has been spent on the way to the score than the best trial needed, which got there."""
         runs, ended = list(self.evaluations), [run.status == "finished" for run in self.runs]
         if (
             self.is_whole(objective) and runs[-1] is not None
         ):  # as it was at the last evaluation that had something to wait for
             runs[-1], ended[-1] = objective.before_score(runs[-1]), False
-        best = best_trial(study)
-        if best is None or best.value is None or objective.at_least(runs, ended) <= best.value:
+        if best is None or objective.at_least(runs, ended) <= best:
             return ""
-        return f"it needs more than the best so far, {best.value:.4g}"
+        return f"it needs more than the best so far, {best:.4g}"
 
     def _too_low(self, objective: Objective, study: optuna.Study) -> str:
         """Whether it is below the median of the others at an evaluation, once all its runs have made it."""

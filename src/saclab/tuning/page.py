@@ -21,7 +21,7 @@ from saclab.training.run_folder import run_path
 from saclab.tuning.figures import figures
 from saclab.tuning.plan import TunePlan, trial_name
 from saclab.tuning.space import value_text, values_of
-from saclab.tuning.study import WHY, best_trial, ended_trials, is_complete
+from saclab.tuning.study import WHY, best_trial, ended_trials, is_complete, reached_score, value_in_words
 
 if TYPE_CHECKING:
     import optuna
@@ -93,12 +93,16 @@ def best_html(study: optuna.Study, plan: TunePlan, folder: Path) -> str:
     best = best_trial(study)
     if best is None:
         return "<p>No trial has come to its end yet.</p>"
+    if not reached_score(best, plan):
+        return f"<p>No trial has got to the score with all of its runs; trial {best.number} came nearest.</p>"
     settings = values_of(plan.space, best.params)
     rows = [(name, value_text(own), value_text(settings[name])) for name, own in plan.own_values.items()]
     own = own_trial(study, plan)
     if own is not None and own.number == best.number:
         return f"<p>Nothing better than the variant's own settings was found: trial {own.number}, {own.value:.4g}.</p>"
-    against = f", against {own.value:.4g} of the variant's own (trial {own.number})" if own is not None else ""
+    against = (
+        f", against {value_in_words(own, plan)} of the variant's own (trial {own.number})" if own is not None else ""
+    )
     caveat = (
         "It is the best of many noisy ones, so the value flatters: the commands train it and the variant's own "
         f"settings with {FRESH_SEEDS} seeds that no trial had, and compare them."
@@ -156,15 +160,21 @@ def trials_table(study: optuna.Study, plan: TunePlan) -> Table:
     rows = tuple(
         (
             str(trial.number),
-            f"{trial.value:.4g}" if is_complete(trial) else "given\N{NO-BREAK SPACE}up",
+            value_in_words(trial, plan).replace(" ", "\N{NO-BREAK SPACE}")
+            if is_complete(trial)
+            else "given\N{NO-BREAK SPACE}up",
             *(value_text(values_of(plan.space, trial.params).get(name, "")) for name in plan.space),
-            shown(trial.user_attrs.get(WHY, ""), 120).replace(" ", "\N{NO-BREAK SPACE}"),
+            unbroken_words(shown(trial.user_attrs.get(WHY, ""), 120)),
         )
         for trial in ended[:LINES]
     )
     more = f" The first {LINES} of {len(ended)}." if len(ended) > LINES else ""
     note = f"The runs of trial n lie in runs/…/{trial_name(0)[:-4]}n: saclab report shows their curves.{more}"
     return Table("Trials", ("trial", "value", *plan.space, "why given up"), rows, note)
+
+
+def unbroken_words(text: str) -> str:
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def figure_html(caption: str, picture: bytes) -> str:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 JOURNAL = "trials.jsonl"
 NAME = "saclab"
+WAY = "runs at the score"
+"""Under this name the study keeps how many of a trial's runs have reached the score, where there is one."""
 WHY = "why"
 """Under this name the study keeps why a trial was given up."""
 TRIALS_BEFORE_PRUNING, EVALUATIONS_BEFORE_PRUNING = 5, 2
@@ -121,3 +123,15 @@ def best_trial(study: optuna.Study) -> FrozenTrial | None:
 def is_complete(trial: FrozenTrial) -> bool:
     """Whether a trial came to its end, and has a value."""
     return trial.state.name == "COMPLETE"
+
+
+def reached_score(trial: FrozenTrial, plan: TunePlan) -> bool:
+    """Whether all runs of a trial have reached the score; where there is none, that is so."""
+    return not plan.objective.kind.to_score or trial.user_attrs.get(WAY) == len(plan.seeds)
+
+
+def value_in_words(trial: FrozenTrial, plan: TunePlan) -> str:
+    """A trial's value, and whether it is one that was never measured: a run that did not get to the score is set."""
+    if reached_score(trial, plan):
+        return f"{trial.value:.4g}"
+    return f"{trial.value:.4g}, with {trial.user_attrs.get(WAY, 0)} of {len(plan.seeds)} runs at the score"

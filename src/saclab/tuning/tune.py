@@ -17,7 +17,7 @@ from saclab.tuning.objective import ObjectiveName
 from saclab.tuning.page import judging_commands, own_trial, write_page
 from saclab.tuning.plan import TunePlan, is_recorded, make_plan
 from saclab.tuning.space import read_space, values_of
-from saclab.tuning.study import best_trial
+from saclab.tuning.study import best_trial, reached_score
 from saclab.tuning.tuner import Tune, search
 
 Show = Callable[[Iterable[Tune]], Tune]
@@ -26,7 +26,7 @@ Show = Callable[[Iterable[Tune]], Tune]
 
 class Tuned(NamedTuple):
     best: dict[str, Any] | None
-    """The settings of the best trial; None if none has come to its end."""
+    """The settings of the best trial; None if none has come to its end, or to the score where there is one."""
     value: float | None
     """What the best trial is worth, by the objective; the best of many noisy ones, so it flatters."""
     own_value: float | None
@@ -34,7 +34,8 @@ class Tuned(NamedTuple):
     trials: int
     """How many have ended."""
     commands: list[list[str]]
-    """The words of commands that judge the best settings against the variant's own, with seeds that no trial had."""
+    """The words of commands that judge the best settings against the variant's own, with seeds that no trial had; none
+    if the variant's own are the best."""
     page: Path | None
     hindered: dict[int, str] = {}  # noqa: RUF012 - a NamedTuple's default, which nobody changes
     """Trials that something from outside has stopped, and what; the same call goes on with them."""
@@ -110,13 +111,15 @@ def tuned(
     with requests_from_signals() as requests:
         state = show(search(plan, folder, trials, resources.pool(checkpoint_minutes), requests, resources.batch))
     best, own = best_trial(state.study), own_trial(state.study, plan)
+    best = best if best is not None and reached_score(best, plan) else None
     settings = None if best is None else values_of(plan.space, best.params)
+    better = best is not None and (own is None or own.number != best.number)
     return Tuned(
         settings,
         None if best is None else best.value,
         None if own is None else own.value,
         len(state.ended),
-        judging_commands(plan, settings, best.number, folder) if best is not None and settings else [],
+        judging_commands(plan, settings, best.number, folder) if better and best is not None and settings else [],
         write_page(state.study, plan, folder),
         state.hindered,
         requests.stop,

@@ -18,7 +18,7 @@ from saclab.training.lock import locked
 from saclab.training.requests import Requests
 from saclab.tuning.open_trial import OpenTrial
 from saclab.tuning.plan import PLAN, TunePlan, is_recorded, trial_name
-from saclab.tuning.study import WHY, best_trial, drawn_settings, ended_trials, open_study, trials_under_way
+from saclab.tuning.study import WAY, WHY, best_trial, drawn_settings, ended_trials, open_study, trials_under_way
 
 if TYPE_CHECKING:
     import optuna
@@ -41,8 +41,8 @@ class Tune:
     batch: int
     open: list[OpenTrial] = field(default_factory=list)
     ended: list[FrozenTrial] = field(default_factory=list)
-    ended_before: int = 0
-    """Trials that had ended when this session began."""
+    ended_before: set[int] = field(default_factory=set)
+    """Numbers of the trials that had ended when this session began."""
     hindered: dict[int, str] = field(default_factory=dict)
     """Trials that something from outside has stopped, and what; the same command goes on with them."""
 
@@ -51,7 +51,7 @@ class Tune:
         for trial in trials_under_way(self.study):
             self._enter(trial)
         self.ended = ended_trials(self.study)
-        self.ended_before = len(self.ended)
+        self.ended_before = {trial.number for trial in self.ended}
         for ended in self.ended:
             self._clear(ended.number)
 
@@ -116,7 +116,7 @@ class Tune:
 
     def _hopeless(self, trial: OpenTrial, news: bool) -> str:
         judged = news and self.plan.pruning and not trial.unreadable
-        return trial.hopeless(self.plan.objective, self.study) if judged else ""
+        return trial.hopeless(self.plan, self.study) if judged else ""
 
     def _end(self, trial: OpenTrial) -> None:
         """Tell what came of a trial whose runs are at rest."""
@@ -125,6 +125,9 @@ class Tune:
         if not trial.given_up and not whole:
             self.hindered[number] = trial.hindrance(self.plan.objective)
             return
+        if self.plan.objective.kind.to_score and not trial.given_up:
+            at_score = sum(trial.reached(place, self.plan.objective) for place in range(len(trial.runs)))
+            trial.trial.set_user_attr(WAY, at_score)
         self._tell(trial.trial, None if trial.given_up else trial.value(self.plan.objective), trial.given_up)
         self._clear(number)
 

@@ -16,7 +16,7 @@ from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
 BASE = "saclab"
-PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "rltools", "mkl", "torch")
+PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "rltools", "mkl", "torchrl", "tensordict", "torch")
 
 
 def speed_table(record: dict[str, Any]) -> str:

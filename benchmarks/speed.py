@@ -70,6 +70,7 @@ PEERS = {
     "SBX": ("stable_baselines3_run.py", "sbx-rl"),
     "Tianshou": ("tianshou_run.py", "tianshou"),
     "RLtools": ("rltools_run.py", "rltools"),
+    "TorchRL": ("torchrl_run.py", "torchrl"),
 }
 
 

@@ -18,7 +18,7 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results"
 BASE = "saclab"
 PEER_ROWS = ("Stable-Baselines3", "SBX", "Tianshou")
-PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "rltools", "mkl", "torch")
+PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "rltools", "mkl", "torchrl", "tensordict", "torch")
 
 
 def speed_table(record: dict[str, Any]) -> str:

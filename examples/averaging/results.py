@@ -66,12 +66,15 @@ def print_arms(comparison: Comparison, environment: str, arms: dict[str, Arm]) -
     print("|---|---|---|---|---|---|---|")
     for name, arm in arms.items():
         runs = comparison.groups[environment, arm]
-        columns = [f"{np.mean(values):.0f} ± {deviation(values):.0f}" for values in measures(runs).values()]
+        columns = [f"{np.mean(values):.0f}{deviation(values)}" for values in measures(runs).values()]
         bias, spread = np.mean([late_bias(run) for run in runs]), np.mean([relative_spread(run) for run in runs])
         print(f"| `{name}` | {len(runs)} | {' | '.join(columns)} | {bias:+.3f} | {spread:.3f} |")
 
 
 def print_pairs(comparison: Comparison, environment: str, arms: dict[str, Arm]) -> None:
+    if min(len(comparison.groups[environment, arm]) for arm in arms.values()) < 2:
+        print("\nSome arm has one seed only: no interval exists, and nothing can be told yet.")
+        return
     print("\n| | pair | measure | difference of means | P(first above second) | effect |\n|---|---|---|---|---|---|")
     for label, (x, y) in PAIRS[environment].items():
         if x not in arms or y not in arms:
@@ -116,8 +119,9 @@ def relative_spread(run: RunRecord) -> float:
     return float(np.mean(run.metrics["snapshot_spread"] / run.metrics["q_spread"]))
 
 
-def deviation(values: np.ndarray) -> float:
-    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+def deviation(values: np.ndarray) -> str:
+    """Behind a mean: nothing for one run."""
+    return f" ± {np.std(values, ddof=1):.0f}" if len(values) > 1 else ""
 
 
 def excludes(interval: Interval, value: float) -> bool:

@@ -22,11 +22,11 @@ TERMS = ("reward_linvel", "reward_quadctrl", "reward_alive")
 PANELS = ["return of reward_linvel", "return of reward_quadctrl", "return of reward_alive", "weight of reward_linvel"]
 
 
-def write_terms(folder: Path, count: int = 30) -> Path:
-    """Terms of which the remainder is nothing but rounding, and a weight that rises."""
+def write_terms(folder: Path, count: int = 30, terms: tuple[str, ...] = TERMS) -> Path:
+    """Three terms of which the remainder is nothing but rounding, and a weight that rises."""
     with (folder / "reward_terms.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(reward_term_columns(TERMS))
+        writer.writerow(reward_term_columns(terms))
         for index in range(1, count + 1):
             counters = [index, 10_000 * index, 2000 * index, 10 * index]
             writer.writerow([*counters, 100.0 * index, -3.0, 500.0, 1e-13, min(1, index / 20), 1.0, 1.0, 20.0 * index])
@@ -49,6 +49,21 @@ def test_the_page_has_a_panel_for_each_term_and_each_weight_but_one(folders):
     assert len(arm["runs"]) == 2
     assert arm["middle"][9] == 0.5
     assert data["pool"][arm["x"]["updates"]][9] == 20_000
+
+
+def test_terms_that_the_log_numbers_are_named_and_arms_that_name_others_apart(tmp_path):
+    folders = []
+    for first in ("vitesse é", "speed (m/s)"):
+        terms = (first, "reward_quadctrl", "reward_alive")
+        folder = write_run(tmp_path, "sac-auto", 0, "Humanoid-v4", overrides={"reward_terms": terms}, name=first[:5])
+        folders.append(write_terms(folder, terms=terms))
+    curves = gather_curves(read_comparison(folders, allow_mixed=True))
+    arms = {quantity.title: [arm for _, arm, other in curves if other == quantity] for _, _, quantity in curves}
+    assert not [title for title in arms if title.endswith(" of 0")]
+    for kind in ("return", "weight"):
+        (french,), (english,) = arms[f"{kind} of vitesse é"], arms[f"{kind} of speed (m/s)"]
+        assert french != english
+    assert len(arms["return of reward_alive"]) == 2
 
 
 def test_runs_without_terms_have_no_such_panels(folders):

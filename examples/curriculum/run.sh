@@ -11,7 +11,7 @@ set -euo pipefail
 runs=${1:?the folder that holds the runs}
 kept=$(dirname "$(realpath "$0")")/runs
 stage=${2:-half-cheetah}
-seeds=${3:-3}
+seeds=${3:-}
 
 # jaxlib 0.10.2 can compile large matrix products wrongly through these fusions (jax issue 39103): not used here.
 export XLA_FLAGS="--xla_cpu_experimental_ynn_fusion_type="
@@ -40,9 +40,9 @@ control-late sac-auto --reward-terms reward_run --reward-schedule 'reward_ctrl: 
 ARMS
 }
 
-commands() {  # environment, limits of the run; the arms come on standard input
-  local environment=$1 arms seed name variant settings
-  shift
+commands() {  # environment, number of seeds, limits of the run; the arms come on standard input
+  local environment=$1 seeds=${seeds:-$2} arms seed name variant settings
+  shift 2
   arms=$(cat)
   for ((seed = 0; seed < seeds; seed++)); do
     while read -r name variant settings; do
@@ -54,9 +54,9 @@ commands() {  # environment, limits of the run; the arms come on standard input
 }
 
 case $stage in
-  half-cheetah) planned=$(half_cheetah | commands HalfCheetah-v4 --max-updates 30000) ;;
+  half-cheetah) planned=$(half_cheetah | commands HalfCheetah-v4 3 --max-updates 30000) ;;
   humanoid)
-    planned=$(humanoid | commands Humanoid-v4 --max-updates 100000 --max-episodes None --patience-episodes None)
+    planned=$(humanoid | commands Humanoid-v4 4 --max-updates 100000 --max-episodes None --patience-episodes None)
     ;;
   *)
     echo "unknown stage $stage: use half-cheetah or humanoid" >&2

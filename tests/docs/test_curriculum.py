@@ -43,12 +43,12 @@ def named_config(words):
     return command.name, config
 
 
-def test_the_script_trains_three_seeds_of_the_arms_of_the_page(stages):
+def test_the_script_trains_the_seeds_and_arms_of_the_page(stages):
     page = (ROOT / "docs/curriculum.md").read_text()
-    expected = {"half-cheetah": ("HalfCheetah-v4", 2, 30_000), "humanoid": ("Humanoid-v4", 3, 100_000)}
-    for stage, (environment, arms, updates) in expected.items():
+    expected = {"half-cheetah": ("HalfCheetah-v4", 2, 3, 30_000), "humanoid": ("Humanoid-v4", 3, 4, 100_000)}
+    for stage, (environment, arms, seeds, updates) in expected.items():
         runs = stages[stage]
-        assert len(runs) == len({(name, config.seed) for name, config in runs}) == 3 * arms
+        assert len(runs) == len({(name, config.seed) for name, config in runs}) == seeds * arms
         assert {config.environment for _, config in runs} == {environment}
         assert {config.planned_updates for _, config in runs} == {updates}
         assert {config.training.patience_episodes for _, config in runs} == {None}

@@ -44,7 +44,7 @@ def test_a_term_that_is_not_told_is_named_with_those_that_are():
 
 
 @pytest.mark.parametrize(("named", "setting"), [((), "reward_schedule"), (("flying",), "reward_terms")])
-def test_a_term_that_is_not_told_is_reported_under_the_setting_that_names_it(named, setting):
+def test_a_term_that_is_not_told_names_the_setting_it_comes_from(named, setting):
     changes = {"reward_terms": named, "reward_schedule": ("flying: 1@0",)}
     with pytest.raises(SettingError, match=f"^{setting} = 'flying': HalfCheetah-v4 does not tell it"):
         spec_of(make_config("HalfCheetah-v4", overrides=changes))

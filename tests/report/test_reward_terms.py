@@ -51,7 +51,7 @@ def test_the_page_has_a_panel_for_each_term_and_each_weight_but_one(folders):
     assert data["pool"][arm["x"]["updates"]][9] == 20_000
 
 
-def test_terms_that_the_log_numbers_are_named_and_arms_that_name_others_apart(tmp_path):
+def test_terms_that_the_log_numbers_are_named_on_the_page(tmp_path):
     folders = []
     for first in ("vitesse é", "speed (m/s)"):
         terms = (first, "reward_quadctrl", "reward_alive")

@@ -13,6 +13,7 @@ from saclab.report.curves import diagnostics, gather_curves
 from saclab.report.report import compared, page_of
 from saclab.report.runs import read_comparison
 from saclab.report.train_command import train_command
+from saclab.sharing.share import copy_results
 from saclab.training.logs import reward_term_columns
 from saclab.training.run_folder import read_run
 
@@ -69,6 +70,16 @@ def test_terms_that_the_log_numbers_are_named_on_the_page(tmp_path):
 def test_runs_without_terms_have_no_such_panels(folders):
     curves = gather_curves(read_comparison(folders[2:]))
     assert not [quantity for quantity in diagnostics(curves, "Humanoid-v4") if quantity.table == "reward_terms"]
+
+
+def test_the_terms_of_a_run_are_shared_with_it(folders, tmp_path):
+    """A copy without them would not be read."""
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    copy_results(folders[0], read_run(folders[0]), copy)
+    assert (copy / "reward_terms.csv").read_bytes() == (folders[0] / "reward_terms.csv").read_bytes()
+    copy_results(folders[2], read_run(folders[2]), tmp_path)
+    assert not (tmp_path / "reward_terms.csv").exists()
 
 
 @pytest.mark.parametrize("line", ["31,310000,62000,310,1,2,3\n", "31,310000,62000,310,x,1,1,1,1,1,1,620\n"])

@@ -36,7 +36,7 @@ ARMS
 half_cheetah() {
   cat <<'ARMS'
 sac-auto sac-auto --reward-terms reward_run reward_ctrl
-control-late sac-auto --reward-terms reward_run --reward-schedule 'reward_ctrl: 0@0.4 4@0.6'
+control-late sac-auto --reward-terms reward_run reward_ctrl --reward-schedule 'reward_ctrl: 0@0.4 4@0.6'
 ARMS
 }
 

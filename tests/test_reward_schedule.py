@@ -85,6 +85,11 @@ def test_a_term_has_a_weight_or_a_schedule():
         AlgorithmSettings(reward_weights=(2.0, 3.0), **given)
 
 
+def test_a_term_is_named_once():
+    with pytest.raises(SettingError, match="reward_terms = 'run control run': name each term once"):
+        AlgorithmSettings(reward_terms=("run", "control", "run"))
+
+
 def test_shares_need_a_number_of_updates_and_returns_do_not():
     limits = {"max_steps": None, "max_episodes": 10}
     make_config("HalfCheetah-v4", overrides={**limits, "reward_schedule": (CLIMB,)})
@@ -122,6 +127,8 @@ def test_the_rows_stand_first_then_walk(variant):
 def test_a_row_without_the_terms_of_an_environment_says_what_to_give():
     with pytest.raises(UserError, match=r"reward_schedule = None: this row does not know .* on HalfCheetah-v4"):
         make_config("HalfCheetah-v4", "curriculum")
+    with pytest.raises(UserError, match=r"reward_schedule = \(\): this row does not know .* on HalfCheetah-v4"):
+        make_config("HalfCheetah-v4", "curriculum", overrides={"reward_schedule": ()})
     given = make_config("HalfCheetah-v4", "curriculum", overrides={"reward_schedule": ("reward_run: 1@0",)})
     assert given.algorithm.terms_of_reward == ("reward_run",)
     assert own_config("HalfCheetah-v4", "curriculum", "quick").algorithm.reward_schedule == ()

@@ -1,16 +1,17 @@
 #!/usr/bin/env bash
-# Trains every run of docs/curriculum.md, two at a time, seed by seed. Stop it at any instant (Ctrl-C, SIGTERM to the
+# Trains the runs of one stage of docs/curriculum.md, two at a time, seed by seed: those on HalfCheetah-v4, or, once
+# their results let it be (H1 of the page), those on Humanoid-v4. Stop it at any instant (Ctrl-C, SIGTERM to the
 # process group, a power cut): the same command goes on, finished runs are skipped, and those whose results lie in
 # examples/curriculum/runs beside this file already.
 #
-#   examples/curriculum/run.sh RUNS [SEEDS_OF_HUMANOID [SEEDS_OF_HALF_CHEETAH]]
+#   examples/curriculum/run.sh RUNS [half-cheetah|humanoid [SEEDS]]
 #
 # SACLAB names the program, if it is not on the PATH.
 set -euo pipefail
 runs=${1:?the folder that holds the runs}
 kept=$(dirname "$(realpath "$0")")/runs
-humanoid_seeds=${2:-3}
-half_cheetah_seeds=${3:-3}
+stage=${2:-half-cheetah}
+seeds=${3:-}
 
 # jaxlib 0.10.2 can compile large matrix products wrongly through these fusions (jax issue 39103): not used here.
 export XLA_FLAGS="--xla_cpu_experimental_ynn_fusion_type="
@@ -28,19 +29,19 @@ humanoid() {  # name, variant and settings of an arm; xargs takes what stands be
   cat <<'ARMS'
 sac-auto sac-auto --reward-terms reward_linvel reward_quadctrl reward_alive
 curriculum curriculum
-curriculum-slow curriculum --reward-schedule 'reward_linvel: 0.2@0.3 1@0.9'
+curriculum-slow curriculum --reward-schedule 'reward_linvel: 0.2@0.3 1@0.8'
 ARMS
 }
 
 half_cheetah() {
   cat <<'ARMS'
 sac-auto sac-auto --reward-terms reward_run reward_ctrl
-control-late sac-auto --reward-terms reward_run --reward-schedule 'reward_ctrl: 0@0.4 4@0.6'
+control-late sac-auto --reward-terms reward_run reward_ctrl --reward-schedule 'reward_ctrl: 0@0.4 4@0.6'
 ARMS
 }
 
 commands() {  # environment, number of seeds, limits of the run; the arms come on standard input
-  local environment=$1 seeds=$2 arms seed name variant settings
+  local environment=$1 seeds=${seeds:-$2} arms seed name variant settings
   shift 2
   arms=$(cat)
   for ((seed = 0; seed < seeds; seed++)); do
@@ -52,9 +53,18 @@ commands() {  # environment, number of seeds, limits of the run; the arms come o
   done
 }
 
+case $stage in
+  half-cheetah) planned=$(half_cheetah | commands HalfCheetah-v4 3 --max-updates 30000) ;;
+  humanoid)
+    planned=$(humanoid | commands Humanoid-v4 4 --max-updates 100000 --max-episodes None --patience-episodes None)
+    ;;
+  *)
+    echo "unknown stage $stage: use half-cheetah or humanoid" >&2
+    exit 2
+    ;;
+esac
+[[ -n $planned ]] || exit 0  # all results lie beside this file
+
 mkdir -p "$runs"
-{
-  half_cheetah | commands HalfCheetah-v4 "$half_cheetah_seeds" --max-updates 30000
-  humanoid | commands Humanoid-v4 "$humanoid_seeds" --max-updates 60000 --patience-episodes None
-} | xargs -P 2 -L 1 --process-slot-var=CORE \
+echo "$planned" | xargs -P 2 -L 1 --process-slot-var=CORE \
   bash -c 'exec taskset --cpu-list "$CORE" nice -n 19 "${SACLAB:-saclab}" "$@" >>"$0/log.txt" 2>&1' "$runs"

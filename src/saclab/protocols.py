@@ -158,20 +158,10 @@ def make_config(
     Raises:
         UserError: for a name that does not exist or a value that cannot work.
     """
-    changes = held_to(protocol_row(protocol).ceilings, variant_changes(variant, environment))
-    said = protocol_settings(protocol, environment) | changes | dict(overrides or {})
     for name, way_out in needed_settings(variant, environment).items():
-        require(name in (overrides or {}), name, None, f"{way_out} (variant {variant} on {environment})")
-    algorithm, training = split_settings(said)
-    return Config(
-        environment=environment,
-        variant=variant,
-        protocol=protocol,
-        seed=seed,
-        algorithm=replace_settings(default_settings(environment), algorithm),
-        training=with_stable_prefill(TrainingSettings(**training)),
-        environment_arguments=dict(environment_arguments or {}),
-    )
+        given = (overrides or {}).get(name)
+        require(bool(given), name, given, f"{way_out} (variant {variant} on {environment})")
+    return own_config(environment, variant, protocol, seed, environment_arguments, overrides)
 
 
 def own_config(
@@ -182,9 +172,19 @@ def own_config(
     environment_arguments: Mapping[str, Any] | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> Config:
-    """What `make_config` gives, with what the variant needs and is not given left empty: to compare a run with."""
-    empty = dict.fromkeys(needed_settings(variant, environment), ())
-    return make_config(environment, variant, protocol, seed, environment_arguments, {**empty, **(overrides or {})})
+    """What `make_config` gives, also where the variant needs a setting that is not given: to compare a run with."""
+    changes = held_to(protocol_row(protocol).ceilings, variant_changes(variant, environment))
+    said = protocol_settings(protocol, environment) | changes | dict(overrides or {})
+    algorithm, training = split_settings(said)
+    return Config(
+        environment=environment,
+        variant=variant,
+        protocol=protocol,
+        seed=seed,
+        algorithm=replace_settings(default_settings(environment), algorithm),
+        training=with_stable_prefill(TrainingSettings(**training)),
+        environment_arguments=dict(environment_arguments or {}),
+    )
 
 
 def with_stable_prefill(training: TrainingSettings) -> TrainingSettings:

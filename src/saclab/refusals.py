@@ -84,8 +84,10 @@ def require_possible(settings: AlgorithmSettings) -> None:
         "entropy_window", settings.entropy_window,
         f"use 1 together with critic_head {settings.critic_head}: it averages numbers, not distributions",
     )  # fmt: skip
+    names = settings.reward_terms
+    require(len(set(names)) == len(names), "reward_terms", " ".join(names), "name each term once")
     scheduled = {term.name for term in settings.scheduled_terms}
-    weighed = [name for name in settings.reward_terms if name not in scheduled]
+    weighed = [name for name in names if name not in scheduled]
     require(
         len(settings.reward_weights) in (0, len(weighed)),
         "reward_weights", " ".join(map(str, settings.reward_weights)),

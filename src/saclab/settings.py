@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 PLAIN_NUMBER = "plain number"
+"""Marks a setting that the compiled update takes as an argument, or that reaches it as part of one, as the weights of a
+schedule do: another value needs no compilation, and runs that differ in such settings only can be one run group."""
 Real = Annotated[float, PLAIN_NUMBER]
-"""A setting that is an argument of the compiled update: another value needs no compilation, and runs that differ in
-such settings only can be trained as one run group."""
 Whole = Annotated[int, PLAIN_NUMBER]
 
 Activation = Literal["relu", "tanh", "elu", "silu", "gelu"]
@@ -329,7 +329,7 @@ def choices() -> dict[str, tuple[str | None, ...]]:
 
 @lru_cache(maxsize=1)
 def plain_numbers() -> tuple[str, ...]:
-    """Names of the settings that are arguments of the compiled update."""
+    """Names of the settings that are arguments of the compiled update, or parts of one."""
     hints = get_type_hints(AlgorithmSettings, include_extras=True)
     return tuple(name for name, hint in hints.items() if PLAIN_NUMBER in getattr(hint, "__metadata__", ()))
 

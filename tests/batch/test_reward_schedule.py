@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 from resume.helpers import assert_same_run
@@ -12,7 +14,7 @@ from saclab.training import loop
 from saclab.training.requests import Requests
 from saclab.training.run_folder import read_run
 
-from .helpers import config, failures, folders, tiny_environments, train
+from .helpers import config, engine_of, failures, folders, tiny_environments, train
 from .test_batch import assert_close
 from .test_long_rounds import LONG, ROUND, pausing_after
 
@@ -39,7 +41,8 @@ def short_parts(monkeypatch):
     monkeypatch.setattr(engines, "SHORTEST_PART", 3)
 
 
-@pytest.mark.parametrize("changes", [pytest.param({"acting_delay": 0}, marks=pytest.mark.slow), LONG])
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", [{"acting_delay": 0}, LONG])
 def test_each_run_has_the_weights_that_it_has_alone(tmp_path, monkeypatch, changes):
     """Weights and terms in every evaluation, losses in every window, the critics' bias of the weighed reward."""
     with tiny_environments(monkeypatch) as prefix:
@@ -60,6 +63,7 @@ def test_each_run_has_the_weights_that_it_has_alone(tmp_path, monkeypatch, chang
     assert {*weights[2]} == {0.5}
 
 
+@pytest.mark.slow
 def test_a_group_that_stops_within_a_round_on_a_slope_goes_on_bit_for_bit(tmp_path, monkeypatch):
     with tiny_environments(monkeypatch) as prefix:
         configs = scheduled(prefix, **LONG)
@@ -71,3 +75,19 @@ def test_a_group_that_stops_within_a_round_on_a_slope_goes_on_bit_for_bit(tmp_pa
         train(tmp_path / "stopped", configs)
         for index in range(len(configs)):
             assert_same_run(tmp_path / f"straight/run-{index}", tmp_path / f"stopped/run-{index}")
+
+
+def test_the_scale_of_each_run_is_that_of_its_weighed_rewards(monkeypatch):
+    """Episodes of one step, of which twice the action counts, or nothing: their deviation by hand."""
+    terms = {"reward_terms": ("right", "left"), "reward_scaling": "deviation"}
+    weights = [(2.0, 0.0), (0.0, 0.0), (0.0, -3.0)]
+    with tiny_environments(monkeypatch) as prefix:
+        configs = [config("sac", 0, prefix + "Leaning-v0", reward_weights=own, **terms) for own in weights]
+        with closing(engine_of(configs)) as group:
+            for _ in range(40):
+                group.step()
+            for index, (right, left) in enumerate(weights):
+                found = group.snapshot(index)
+                action = np.array(found.replay.layout.unpack(found.replay.rows[:40]).action[:, 0], np.float64)
+                expected = abs(right - left) * action.std()
+                assert float(found.run.reward_scale.value) == pytest.approx(expected, rel=1e-3, abs=0.01)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -18,36 +19,57 @@ for word in "$@"; do printf '%s\\n' "$word"; done >"$NOTES/$$"
 
 
 @pytest.fixture(scope="module")
-def configs(tmp_path_factory):
-    """The configuration of each run that the script would train."""
+def stages(tmp_path_factory):
+    """Stage -> the name and the configuration of each run that the script would train, were none at hand."""
     folder = tmp_path_factory.mktemp("curriculum")
-    program, notes = folder / "saclab", folder / "notes"
+    program, script = folder / "saclab", folder / "run.sh"
     program.write_text(NOTING)
     program.chmod(0o755)
-    notes.mkdir()
-    environment = os.environ | {"SACLAB": str(program), "NOTES": str(notes)}
-    subprocess.run([ROOT / "examples/curriculum/run.sh", folder / "runs"], env=environment, check=True, timeout=100)
-    found = []
-    for path in notes.iterdir():
-        command = parse(path.read_text().splitlines())
-        given = {**command.algorithm, **command.training}
-        found.append((command.name, make_config(command.environment, command.variant, command.protocol,
-                                                command.seed, overrides=given)))  # fmt: skip
+    shutil.copy(ROOT / "examples/curriculum/run.sh", script)
+    found = {}
+    for stage in ("half-cheetah", "humanoid"):
+        notes = folder / stage
+        notes.mkdir()
+        environment = os.environ | {"SACLAB": str(program), "NOTES": str(notes)}
+        subprocess.run([script, folder / "runs", stage], env=environment, check=True, timeout=100)
+        found[stage] = [named_config(path.read_text().splitlines()) for path in notes.iterdir()]
     return found
 
 
-def test_the_script_trains_three_seeds_of_the_arms_of_the_page(configs):
-    arms = {(config.environment, name, config.seed) for name, config in configs}
-    assert len(arms) == len(configs) == 3 * (2 + 3)
+def named_config(words):
+    command = parse(words)
+    given = {**command.algorithm, **command.training}
+    config = make_config(command.environment, command.variant, command.protocol, command.seed, overrides=given)
+    return command.name, config
+
+
+def test_the_script_trains_the_seeds_and_arms_of_the_page(stages):
     page = (ROOT / "docs/curriculum.md").read_text()
-    for name, config in configs:
-        assert f"| `{name}` |" in page
-        for text in config.algorithm.reward_schedule:
-            assert f"`{text}` |" in page
-    assert {config.planned_updates for _, config in configs} == {30_000, 60_000}
-    assert {config.training.patience_episodes for _, config in configs} == {None}
+    expected = {"half-cheetah": ("HalfCheetah-v4", 2, 3, 30_000), "humanoid": ("Humanoid-v4", 3, 4, 100_000)}
+    for stage, (environment, arms, seeds, updates) in expected.items():
+        runs = stages[stage]
+        assert len(runs) == len({(name, config.seed) for name, config in runs}) == seeds * arms
+        assert {config.environment for _, config in runs} == {environment}
+        assert {config.planned_updates for _, config in runs} == {updates}
+        assert {config.training.patience_episodes for _, config in runs} == {None}
+        assert {config.training.max_episodes for _, config in runs} == {None}
+        for name, config in runs:
+            assert f"| `{name}` |" in page
+            assert all(f"`{text}` |" in page for text in config.algorithm.reward_schedule)
 
 
-def test_every_arm_logs_the_terms_that_are_compared(configs):
-    forward = {"HalfCheetah-v4": "reward_ctrl", "Humanoid-v4": "reward_linvel"}
-    assert all(forward[config.environment] in config.algorithm.terms_of_reward for _, config in configs)
+def test_an_arm_differs_from_its_baseline_in_the_schedule_alone(stages):
+    for runs in stages.values():
+        baselines = {config.seed: config for name, config in runs if name == "sac-auto"}
+        for name, config in runs:
+            differences = set(config.differences(baselines[config.seed]))
+            told = {difference.rpartition(".")[2] for difference in differences}
+            assert told <= {"variant", "reward_schedule"}
+            assert ("reward_schedule" in told) == (name != "sac-auto")
+
+
+def test_an_unknown_stage_is_told(tmp_path):
+    script = ROOT / "examples/curriculum/run.sh"
+    told = subprocess.run([script, tmp_path / "runs", "ant"], capture_output=True, text=True, timeout=100)
+    assert told.returncode == 2
+    assert "unknown stage ant: use half-cheetah or humanoid" in told.stderr

@@ -8,6 +8,8 @@ import pytest
 from saclab.environments.reward_terms import split_reward
 from saclab.environments.vector import TrainingEnvironments
 from saclab.errors import NonFiniteError, SettingError
+from saclab.protocols import make_config
+from saclab.training.engine import spec_of
 
 TERMS = {
     "Ant-v4": ("reward_forward", "reward_ctrl", "reward_survive"),
@@ -39,6 +41,13 @@ def test_the_remainder_is_what_the_terms_leave():
 def test_a_term_that_is_not_told_is_named_with_those_that_are():
     with pytest.raises(SettingError, match=r"reward_terms = .*walking.*it tells forward$"):
         split_reward("Some-v0", 1.0, {"forward": 2.0, "position": np.zeros(3)}, ("walking",))
+
+
+@pytest.mark.parametrize(("named", "setting"), [((), "reward_schedule"), (("flying",), "reward_terms")])
+def test_a_term_that_is_not_told_names_the_setting_it_comes_from(named, setting):
+    changes = {"reward_terms": named, "reward_schedule": ("flying: 1@0",)}
+    with pytest.raises(SettingError, match=f"^{setting} = 'flying': HalfCheetah-v4 does not tell it"):
+        spec_of(make_config("HalfCheetah-v4", overrides=changes))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])

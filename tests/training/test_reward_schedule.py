@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from contextlib import closing
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from saclab.config import Config
 from saclab.memory import needed_memory
 from saclab.protocols import make_config
 from saclab.records import Damaged
+from saclab.training import loop
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.local_engine import LocalBuilder, LocalEngine
 from saclab.training.logs import reward_term_columns
+from saclab.training.requests import Requests
 from saclab.training.run_folder import read_run
 
 CHEETAH = "HalfCheetah-v4"
@@ -79,6 +82,7 @@ def learned(**changes: object) -> np.ndarray:
         return np.asarray(engine.learner_state.critic.weights)
 
 
+@pytest.mark.slow
 def test_a_schedule_of_ones_is_the_run_with_terms_bit_for_bit():
     names = ("reward_run", "reward_ctrl")
     ones = learned(reward_schedule=[f"{name}: 1@0 1@0.4 1@1" for name in names])
@@ -92,7 +96,7 @@ ALL_AT_ONCE = {"reward_scaling": "deviation", "n_step": 3, "acting_delay": 1}
 
 @pytest.mark.parametrize("changes", [ALL_AT_ONCE, pytest.param({}, marks=pytest.mark.slow)])
 def test_a_run_that_stops_on_a_slope_goes_on_bit_for_bit(changes, tmp_path):
-    """The stop comes in the middle of a round too; one term goes by the updates, one by the returns."""
+    """The stop comes between two rounds; one term goes by the updates, one by the returns."""
     schedule = ("reward_ctrl: 0@0.1 3@0.9", "reward_run: 0@return=-200 1@return=0")
     rounds = {"update_interval": 10, "updates_per_interval": 7}
     config = small_config(CHEETAH, "sac-auto", reward_schedule=schedule, **rounds, **changes)
@@ -102,6 +106,39 @@ def test_a_run_that_stops_on_a_slope_goes_on_bit_for_bit(changes, tmp_path):
     assert_same_run(tmp_path / "straight", tmp_path / "stopped")
     weights = read_run(tmp_path / "straight").reward_terms["weight_reward_ctrl"]
     assert 0 < weights[0] < weights[1] <= 3
+
+
+def test_a_run_that_stops_within_a_round_on_a_slope_goes_on_bit_for_bit(tmp_path):
+    """The rest of the round has the weights of its beginning, whatever was made of it before."""
+    rounds = {"update_interval": 10, "updates_per_interval": 7, "max_steps": 130}
+    config = small_config("Leaning-v0", "sac-auto", reward_schedule=("right: 0@0.1 3@0.9",), **rounds)
+    finish(config, tmp_path / "straight")
+    requests, real, left = Requests(), LocalEngine.make_updates, []
+
+    def make_updates(engine, should_pause):
+        def asked():
+            if engine.run.counters.updates == 3 * 7 + 4:
+                requests.stop = 1
+                left.append(engine.run.updates_left)
+            return should_pause()
+
+        real(engine, asked)
+
+    with mock.patch.object(LocalEngine, "make_updates", make_updates):
+        list(loop.train(config, tmp_path / "stopped", requests))
+    assert left == [3]
+    finish(config, tmp_path / "stopped")
+    assert_same_run(tmp_path / "straight", tmp_path / "stopped")
+
+
+def test_the_scale_of_the_rewards_is_that_of_the_weighed_ones():
+    """Episodes of one step, of which twice the action counts: the returns are that, and the scale their deviation."""
+    weights = {"reward_terms": ("right", "left"), "reward_weights": (2.0, 0.0), "reward_scaling": "deviation"}
+    with closing(LocalEngine.new(make_config("Leaning-v0", "sac", overrides={**SMALL, **weights}))) as engine:
+        for _ in range(20):
+            engine.step()
+        right = np.array(engine.replay.layout.unpack(engine.replay.rows[:20]).action[:, 0], np.float64)
+        assert float(engine.context.reward_scale) == pytest.approx(2 * right.std(), rel=1e-3)
 
 
 def test_each_evaluation_logs_the_terms_of_its_return_and_their_weights(tmp_path):

@@ -38,7 +38,7 @@ def test_a_term_that_is_told_no_more_ends_the_run(tmp_path, together, monkeypatc
             with pytest.raises(RunBroken) as caught:
                 list(train(config, tmp_path))
             message = str(caught.value)
-    assert "reward_terms = 'left'" in message
+    assert "reward term 'left'" in message
     assert "though it did in the first step" in message
     assert json.loads((tmp_path / "failure/failure.json").read_text())["counters"]["steps"] == 30
 

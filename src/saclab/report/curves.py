@@ -12,6 +12,7 @@ from saclab.report.arms import Arm
 from saclab.report.runs import Comparison
 from saclab.report.statistics import bootstrap_band
 from saclab.report.text import shown
+from saclab.training.logs import REMAINDER, plain_words
 from saclab.training.run_folder import RunRecord
 
 AXES = {
@@ -139,18 +140,29 @@ def reward_terms(runs: Sequence[RunRecord]) -> tuple[Quantity, ...]:
 
     A remainder that is nothing but rounding is none.
     """
-    logged = {name: None for run in runs for name in run.reward_terms}
-    values = {
-        name: np.concatenate([run.reward_terms[name] for run in runs if name in run.reward_terms]) for name in logged
-    }
-    largest = {name: np.abs(column).max(initial=0) for name, column in values.items() if name.startswith("return_")}
+    tables = [named_terms(run) for run in runs]
+    logged = {name: None for table in tables for name in table}
+    values = {name: np.concatenate([table[name] for table in tables if name in table]) for name in logged}
+    largest = {name: np.abs(column).max(initial=0) for name, column in values.items() if name.startswith("return of ")}
     returns = [name for name, size in largest.items() if size > ROUNDING * max(largest.values())]
-    weights = [name for name, column in values.items() if name.startswith("weight_") and (column != 1).any()]
+    weights = [name for name, column in values.items() if name.startswith("weight of ") and (column != 1).any()]
     return tuple(
-        Quantity(f"term {name}", shown(name.replace("_", " of ", 1), 50), "reward_terms", name, "updates", meaning)
+        Quantity(f"term {name}", shown(name, 50), "reward_terms", name, "updates", meaning)
         for names, meaning in ((returns, OF_RETURN), (weights, OF_WEIGHT))
         for name in names
     )
+
+
+def named_terms(run: RunRecord) -> dict[str, np.ndarray]:
+    """A run's log of reward terms with 'return of <term>' for columns, where the log may have a number for the term."""
+    terms = run.config.algorithm.terms_of_reward
+    names = dict(zip(plain_words(terms), terms, strict=True)) | {REMAINDER: "the remainder"}
+
+    def named(column: str) -> str:
+        kind, _, word = column.partition("_")
+        return f"{kind} of {names.get(word, word)}" if kind in ("return", "weight") else column
+
+    return {named(column): values for column, values in run.reward_terms.items()}
 
 
 def other_metrics(runs: Sequence[RunRecord]) -> tuple[Quantity, ...]:
@@ -172,7 +184,8 @@ def diagnostics(curves: Curves, environment: str) -> tuple[Quantity, ...]:
 
 def series(run: RunRecord, quantity: Quantity) -> Series | None:
     """The quantity over all axes of a run; None if the run has no finite value of it yet."""
-    table: dict[str, np.ndarray] = getattr(run, quantity.table)
+    of_terms = quantity.table == "reward_terms"
+    table: dict[str, np.ndarray] = named_terms(run) if of_terms else getattr(run, quantity.table)
     if len(table.get(quantity.column, ())) == 0:
         return None
     y = np.asarray(table[quantity.column], np.float64)

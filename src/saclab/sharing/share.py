@@ -18,10 +18,11 @@ from saclab.sharing.model_card import VIDEO, Card
 from saclab.sharing.private import public_description, public_result, require_no_paths
 from saclab.trained_policy import POLICY_BYTES, policy_folder
 from saclab.trained_policy import read_description as read_policy_description
+from saclab.training.logs import OF_TERMS
 from saclab.training.run_folder import RunRecord, read_description, read_result, read_run
 
 CARD, ONNX = "README.md", "policy.onnx"
-RESULTS = ("config.json", "result.json", "evaluations.csv")
+RESULTS = ("config.json", "result.json", "evaluations.csv", OF_TERMS)
 FILM_STEPS, FILM_SIZE = 1000, 320
 """Of a film that is made for sharing: an episode of most environments, in steps; pixels."""
 
@@ -111,7 +112,8 @@ def collected(run: Path, card: Card, video: bool, onnx: bool, tell: Tell) -> Ite
 def copy_results(run: Path, found: RunRecord, folder: Path) -> None:
     """The configuration, the evaluations and the result, without what tells of the machine."""
     write_json(folder / "config.json", public_description(read_description(run, {})))
-    replace_file(folder / "evaluations.csv", read_bytes(run / "evaluations.csv"))
+    for name in ("evaluations.csv", *([OF_TERMS] if found.reward_terms else [])):
+        replace_file(folder / name, read_bytes(run / name))
     result = read_result(run)
     if result is not None:
         write_json(folder / "result.json", public_result(result))

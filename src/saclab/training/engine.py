@@ -159,7 +159,8 @@ def spec_of(config: Config) -> EnvironmentSpec:
             _, reward, _, _, info = environment.step(
                 environment.spec.scale_action(np.zeros(environment.spec.action_size))
             )
-            split_reward(config.environment, reward, info, names)
+            scheduled = set(names) - set(config.algorithm.reward_terms)
+            split_reward(config.environment, reward, info, names, scheduled)
         return environment.spec
     finally:
         environment.close()

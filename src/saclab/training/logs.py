@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 
-from saclab.records import EPISODES, Q_BIAS, FileRecord, read_bytes, require_recorded
+from saclab.records import COUNTERS, EPISODES, Q_BIAS, FileRecord, read_bytes, require_recorded
 
 LOGS = ("metrics.jsonl", "episodes.csv", "evaluations.csv", "q_bias.csv")
 OF_TERMS = "reward_terms.csv"
@@ -25,22 +25,24 @@ def evaluation_columns(episodes: int) -> tuple[str, ...]:
     """`seconds` is wall-clock time, here as in every log: the only entry that differs between equal runs."""
     returns = [f"return_{index}" for index in range(episodes)]
     lengths = [f"length_{index}" for index in range(episodes)]
-    return ("evaluation", "steps", "updates", "episodes", "mean_return", *returns, *lengths, "seconds")
+    return (*COUNTERS, "mean_return", *returns, *lengths, "seconds")
 
 
 def reward_term_columns(terms: Sequence[str]) -> tuple[str, ...]:
-    """return_<term> of each term and of the remainder, then weight_<term> of each, which counts from then on.
+    """return_<term> of each term and of the remainder, then weight_<term> of each, which counts from then on."""
+    plain = plain_words(terms)
+    returns = [f"return_{word}" for word in (*plain, REMAINDER)]
+    weights = [f"weight_{word}" for word in plain]
+    return (*COUNTERS, *returns, *weights, "seconds")
 
-    A term whose name is no plain word has its number, from 0, in its place.
-    """
+
+def plain_words(terms: Sequence[str]) -> list[str]:
+    """What stands for each term in the columns of a log: its name, or its number, from 0, where that is no word."""
 
     def is_plain(term: str) -> bool:
-        return bool(re.fullmatch(r"(?!\d+$)[A-Za-z0-9_.-]+", term)) and [*terms, REMAINDER].count(term) == 1
+        return bool(re.fullmatch(r"(?!\d+$)[A-Za-z0-9_.-]+", term)) and term != REMAINDER
 
-    plain = [term if is_plain(term) else str(number) for number, term in enumerate(terms)]
-    returns = [f"return_{name}" for name in (*plain, REMAINDER)]
-    weights = [f"weight_{name}" for name in plain]
-    return ("evaluation", "steps", "updates", "episodes", *returns, *weights, "seconds")
+    return [term if is_plain(term) else str(number) for number, term in enumerate(terms)]
 
 
 class Logs:

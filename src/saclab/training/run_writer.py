@@ -111,25 +111,18 @@ class RunWriter:
     def log_evaluation(self, episodes: EvaluationEpisodes, best: bool, bias: QBias | None) -> Evaluated:
         """Log an evaluation that the run has taken in, and beside it the terms of its return and the critics' bias."""
         counters = self.run.counters
-        self.logs.evaluation(
-            counters.evaluations, counters.steps, counters.updates, counters.episodes, counters.last_return,
-            *episodes.total_rewards.tolist(), *episodes.lengths.tolist(), self._seconds(),
-        )  # fmt: skip
+        counted = counters.evaluations, counters.steps, counters.updates, counters.episodes
+        returns, lengths = episodes.total_rewards.tolist(), episodes.lengths.tolist()
+        self.logs.evaluation(*counted, counters.last_return, *returns, *lengths, self._seconds())
         if self.run.config.algorithm.terms_of_reward:
             *weights, _ = self.run.reward_weights()
-            self.logs.reward_terms(
-                counters.evaluations, counters.steps, counters.updates, counters.episodes,
-                *episodes.term_returns.mean(axis=0).tolist(), *weights, self._seconds(),
-            )  # fmt: skip
+            returns = episodes.term_returns.mean(axis=0).tolist()
+            self.logs.reward_terms(*counted, *returns, *weights, self._seconds())
         if bias is not None:
-            self.logs.q_bias(
-                counters.evaluations, counters.steps, counters.updates, counters.episodes, *bias, self._seconds()
-            )
+            self.logs.q_bias(*counted, *bias, self._seconds())
         if best:
             self._write_best()
-        return Evaluated(
-            counters.evaluations, counters.steps, counters.updates, counters.episodes, episodes.total_rewards, best
-        )
+        return Evaluated(*counted, episodes.total_rewards, best)
 
     def _write_best(self) -> None:
         run = self.run

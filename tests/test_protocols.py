@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
+import numpy as np
 import pytest
 
-from saclab.errors import UserError
+from saclab.errors import SettingError, UserError
 from saclab.protocols import PROTOCOLS, make_config
 from saclab.variants import COMPARED, VARIANTS, Variant, variant_settings
 
@@ -91,3 +93,35 @@ def test_a_setting_that_does_not_exist_is_refused_wherever_it_stands(row):
 
 def test_the_variants_of_a_comparison_exist():
     assert set(COMPARED) < set(VARIANTS)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"discount": "x"}, "discount = 'x': Expected `float`, got `str`"),
+        ({"batch_size": 32.5}, "batch_size = 32.5: Expected `int`, got `float`"),
+        ({"hidden_layers": 32}, "hidden_layers = 32: Expected `array`, got `int`"),
+        ({"max_steps": "many"}, "max_steps = 'many': Expected `int | null`"),
+    ],
+)
+def test_a_value_of_another_type_is_refused_in_words(settings, message):
+    with pytest.raises(SettingError, match=re.escape(message)):
+        make_config("Pendulum-v1", overrides=settings)
+    with pytest.raises(SettingError, match="seed = 'a': Expected `int`"):
+        make_config("Pendulum-v1", seed="a")
+
+
+def test_numbers_of_numpy_and_lists_are_taken_as_their_type_has_them():
+    changed = {
+        "discount": np.float32(0.5),
+        "batch_size": np.int64(8),
+        "hidden_layers": [4, 4],
+        "initial_temperature": 1,
+    }
+    algorithm = make_config("Pendulum-v1", overrides=changed).algorithm
+    assert (algorithm.discount, algorithm.batch_size, algorithm.hidden_layers) == (0.5, 8, (4, 4))
+    assert [type(algorithm.discount), type(algorithm.batch_size), type(algorithm.initial_temperature)] == [
+        float,
+        int,
+        float,
+    ]

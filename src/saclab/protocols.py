@@ -6,10 +6,12 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_type_hints
+
+import msgspec
 
 from saclab.config import Config
-from saclab.errors import require, unknown_name
+from saclab.errors import SettingError, require, unknown_name
 from saclab.files import absolute
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names, replace_settings
 from saclab.variants import default_settings, needed_settings, task_name, variant_changes
@@ -175,16 +177,30 @@ def own_config(
     """What `make_config` gives, also where the variant needs a setting that is not given: to compare a run with."""
     changes = held_to(protocol_row(protocol).ceilings, variant_changes(variant, environment))
     said = protocol_settings(protocol, environment) | changes | dict(overrides or {})
-    algorithm, training = split_settings(said)
+    algorithm, training = map(typed, split_settings(said), (AlgorithmSettings, TrainingSettings))
     return Config(
         environment=environment,
         variant=variant,
         protocol=protocol,
-        seed=seed,
+        seed=of_type("seed", seed, int),
         algorithm=replace_settings(default_settings(environment), algorithm),
         training=with_stable_prefill(TrainingSettings(**training)),
         environment_arguments=dict(environment_arguments or {}),
     )
+
+
+def typed(settings: Mapping[str, Any], kind: type[AlgorithmSettings | TrainingSettings]) -> dict[str, Any]:
+    """Settings by name, each of its type; raises SettingError for a value of another."""
+    hints = get_type_hints(kind)
+    return {name: of_type(name, value, hints[name]) for name, value in settings.items()}
+
+
+def of_type(name: str, value: Any, hint: Any) -> Any:
+    """A value as its type has it: a list as a tuple, a whole number as a float, a number of NumPy's as Python's."""
+    try:
+        return msgspec.convert(value.item() if hasattr(value, "item") else value, hint)
+    except msgspec.ValidationError as error:
+        raise SettingError(name, value, str(error)) from error
 
 
 def with_stable_prefill(training: TrainingSettings) -> TrainingSettings:

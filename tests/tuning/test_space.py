@@ -23,7 +23,7 @@ def plan(space=(), variant="sac-auto", overrides=(), objective="mean", score=Non
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_variant_has_a_space_whose_ends_can_all_be_built(variant):
-    given = dict.fromkeys(VARIANTS[variant].needs, ())
+    given = dict.fromkeys(VARIANTS[variant].needs, ("reward: 0.5@0.1 1@0.5",))
     searched = plan(variant=variant, overrides=given).space
     assert {"discount", "critic_learning_rate", "actor_learning_rate"} <= searched.keys()
     for name, dimension in searched.items():

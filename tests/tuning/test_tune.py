@@ -273,8 +273,8 @@ def test_a_damaged_journal_is_a_users_error(tmp_path):
 def test_seeds_and_settings_that_cannot_be_are_refused():
     with pytest.raises(saclab.UserError, match=r"seeds = \(0, 0\): name each once"):
         plan_of(seeds=[0, 0])
-    with pytest.raises(saclab.UserError, match="use Python's own numbers"):
-        make_plan("Pendulum-v1", "sac", "quick", 1, "mean", None, {}, {"polyak_rate": np.float32(0.1)}, {}, 0, True)
+    with pytest.raises(saclab.UserError, match="polyak_rate = 'fast': Expected `float`"):
+        make_plan("Pendulum-v1", "sac", "quick", 1, "mean", None, {}, {"polyak_rate": "fast"}, {}, 0, True)
 
 
 def test_a_torn_last_line_of_the_journal_is_cut_off(tmp_path):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from saclab.config import Config, is_json
+from saclab.config import Config, flatten
 from saclab.errors import SettingError, UserError, require, shown
 from saclab.grid.plan import Cell, seed_numbers
 from saclab.protocols import make_config
@@ -104,10 +104,10 @@ def make_plan(
     require(0 <= search_seed < 2**31, "search_seed", search_seed, "use a whole number from 0 to 2**31 - 1")
     numbers = tuple(seed_numbers(seeds, protocol))
     require(len({*numbers}) == len(numbers), "seeds", numbers, "name each once")
-    require(is_json(dict(overrides)), "overrides", dict(overrides), "use Python's own numbers, texts and lists")
+    config = flatten(make_config(environment, variant, protocol, 0, environment_arguments, overrides).to_dict())
     bare = TunePlan(
         environment, variant, protocol, numbers, objective_of(objective, score), {},
-        dict(overrides), dict(environment_arguments), search_seed, pruning,
+        {name: config[name] for name in overrides}, dict(environment_arguments), search_seed, pruning,
     )  # fmt: skip
     plan = dataclasses.replace(bare, space=changed_space(possible_defaults(bare), space))
     for name, dimension in plan.space.items():

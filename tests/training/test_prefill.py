@@ -235,6 +235,8 @@ def test_other_runs_that_do_not_fit_are_refused(other, tmp_path):
     assert "its observations have 3 numbers, and this run's have 2" in said
     bounded = prefilled(f"policy:{other}", "environments.tiny:Counting-v0")
     assert "its actions lie between [-2.] and [2.], and this run's between [-1.] and [1.]" in refusal(bounded, own)
+    bounded = prefilled(f"replay:{other}", "environments.tiny:Counting-v0")
+    assert "its actions lie between [-2.] and [2.], and this run's between [-1.] and [1.]" in refusal(bounded, own)
     terms = prefilled(f"replay:{other}", "HalfCheetah-v4", reward_terms=("reward_run",))
     assert "its reward_terms are (), and this run's are ('reward_run',)" in refusal(terms, own)
     terms = prefilled(f"minari:{PENDULUM}", "HalfCheetah-v4", reward_terms=("reward_run",))
@@ -256,6 +258,18 @@ def test_a_run_without_a_whole_checkpoint_is_refused_and_left_alone(tmp_path):
         path.unlink()
     checkpoint.rmdir()
     assert "it has none: let that run go on until it saves" in refusal(config, own)
+
+
+def test_a_run_that_does_not_tell_its_action_bounds_is_told_of(tmp_path):
+    """One that was stopped before its first evaluation has no policy yet."""
+    stop_at(40, small_config("Pendulum-v1", "sac"), tmp_path)
+    config = prefilled(f"replay:{tmp_path}")
+    builder = LocalBuilder(config)
+    told = read_prefill(config, builder.spec, builder.layout).notes
+    assert (
+        told[-1]
+        == f"whether the actions of replay:{tmp_path} have this run's bounds is not known: it has no readable policy"
+    )
 
 
 def test_a_replay_with_what_is_not_finite_is_refused_with_its_place(tmp_path):

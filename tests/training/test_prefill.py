@@ -19,6 +19,7 @@ from saclab.replay import ReplayBuffer, RowLayout, Windows
 from saclab.training import loop
 from saclab.training.checkpoint import newest_first, read_checkpoint, save_checkpoint
 from saclab.training.events import Started
+from saclab.training.guide import Guide
 from saclab.training.local_engine import LocalBuilder, LocalEngine
 from saclab.training.manifest import Moment
 from saclab.training.prefill import begin_with, read_prefill, side_by_side
@@ -175,6 +176,18 @@ def test_the_random_steps_are_acted_by_the_other_runs_policy(other):
         assert engine.replay.rows[:40, 3].std() > 0
         engine.step()
         assert not engine.run.exploring()
+
+
+def test_a_policy_is_known_by_what_decides_how_it_acts(other):
+    """A learning rate, or a setting that a later version adds, leaves its digest as it is."""
+    policy, layout = saclab.load_policy(other), RowLayout(3, 1)
+
+    def digest(parameters=policy.parameters, **changes) -> str:
+        return Guide(dataclasses.replace(policy.settings, **changes), layout, parameters).sha256
+
+    assert digest() == digest(discount=0.5, critic_learning_rate=0.1)
+    others = digest(policy.parameters + 1), digest(log_std_minimum=-3.0), digest(log_std_bounding="tanh")
+    assert len({digest(), *others}) == 4
 
 
 def test_a_policy_of_another_task_is_told_of(other):

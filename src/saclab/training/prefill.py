@@ -190,9 +190,8 @@ def bounds_notes(config: Config, spec: EnvironmentSpec, folder: Path) -> list[st
     try:
         there = load_policy(folder / "best").spec
     except UserError:
-        return [
-            f"whether the actions of {config.training.prefill} have this run's bounds is not known: it has no readable policy"
-        ]
+        name = config.training.prefill
+        return [f"whether the actions of {name} have this run's bounds is not known: it has no readable policy"]
     if there.action_size == spec.action_size:
         require_same_bounds(config, spec, there)
     return []

@@ -14,7 +14,7 @@ from resume.helpers import finish, small_config, stop_at
 import saclab
 from saclab.errors import SettingError, UserError
 from saclab.protocols import make_config
-from saclab.records import read_json
+from saclab.records import Prefilled, read_json
 from saclab.replay import ReplayBuffer, RowLayout, Windows
 from saclab.training import loop
 from saclab.training.checkpoint import newest_first, read_checkpoint, save_checkpoint
@@ -217,6 +217,19 @@ def test_settings_that_cannot_be_are_refused(changes, said):
         small_config("Pendulum-v1", "sac", **changes)
 
 
+def test_a_model_on_the_hub_has_to_be_downloaded_first():
+    with pytest.raises(
+        SettingError, match=r"prefill = 'policy:hf:ada/x@v1': .* with hf download ada/x --revision v1 --local-"
+    ):
+        make_config("Pendulum-v1", overrides={"prefill": "policy:hf:ada/x@v1"})
+    assert make_config("Pendulum-v1", overrides={"prefill": "policy:./hf:x"}).training.prefill.endswith("/hf:x")
+
+
+def test_a_policy_is_told_as_one():
+    assert str(Prefilled(0, "a" * 64)) == "a policy, SHA-256 aaaaaaaaaaaaaaaa"
+    assert str(Prefilled(3, "a" * 64)) == "3 transitions, SHA-256 aaaaaaaaaaaaaaaa"
+
+
 def test_paths_do_not_depend_on_the_working_directory(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/ada")
@@ -317,8 +330,8 @@ def test_a_run_that_has_to_begin_anew_begins_with_the_same_or_not_at_all(shelf, 
 
     minari.delete_dataset(name)
     record(name, gymnasium.make("Pendulum-v1"), 51)
-    with pytest.raises(UserError, match=r"has begun with another prefill 'minari:.*it had 50 transitions with the SHA-"
-                       r"256 .*, and has 51 transitions with"):  # fmt: skip
+    with pytest.raises(UserError, match=r"has begun with another prefill 'minari:.*it had 50 transitions, SHA-256 .* "
+                       r"then, and has 51 transitions, SHA"):  # fmt: skip
         list(loop.train(config, tmp_path))
 
 

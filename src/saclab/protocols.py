@@ -194,8 +194,9 @@ def with_stable_prefill(training: TrainingSettings) -> TrainingSettings:
         return training
     require(
         kind == "minari" or not name.startswith("hf:"), "prefill", training.prefill,
-        f"it takes folders of this machine: download the model first, with hf download "
-        f"{name[3:].replace('@', ' --revision ')} --local-dir model, then write {kind}:model (a folder of that name is {kind}:./{name})",
+        "it takes folders of this machine: download the model first, with hf download "
+        f"{name[3:].replace('@', ' --revision ')} --local-dir model, then write {kind}:model "
+        f"(a folder of that name is {kind}:./{name})",
     )  # fmt: skip
     return dataclasses.replace(training, prefill=f"{kind}:{absolute(os.path.expanduser(name))}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from contextlib import closing
 
 import gymnasium
@@ -22,7 +23,7 @@ from saclab.training.events import Started
 from saclab.training.guide import Guide
 from saclab.training.local_engine import LocalBuilder, LocalEngine
 from saclab.training.manifest import Moment
-from saclab.training.prefill import begin_with, read_prefill, side_by_side
+from saclab.training.prefill import begin_with, digest_of, read_prefill, side_by_side
 from saclab.training.run_folder import read_run
 from saclab.training.run_state import RunState
 
@@ -267,6 +268,29 @@ def test_other_runs_that_do_not_fit_are_refused(other, tmp_path):
     assert "its reward_terms are (), and this run's are ('reward_run',)" in refusal(terms, own)
     terms = prefilled(f"minari:{PENDULUM}", "HalfCheetah-v4", reward_terms=("reward_run",))
     assert "a Minari data set tells rewards and not their terms" in refusal(terms, own)
+
+
+@pytest.mark.parametrize("source", ["minari", "replay", "policy"])
+def test_a_source_that_cannot_be_read_is_named_and_not_the_run(tmp_path, source):
+    """A loop of links raises an OSError whoever asks."""
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    said = refusal(prefilled(f"{source}:{tmp_path / 'loop' / 'x'}"), tmp_path / "own")
+    assert f"{tmp_path / 'loop'}" in said
+    assert "cannot write to" not in said
+
+
+def test_an_error_of_the_disk_is_one_of_the_prefill(tmp_path, monkeypatch):
+    def broken(*_):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr("saclab.training.prefill.read_config", broken)
+    said = refusal(prefilled("replay:/broken"), tmp_path / "own")
+    assert said == "prefill = 'replay:/broken': it cannot be read (Input/output error)"
+
+
+def test_the_digest_in_parts_is_that_of_the_whole():
+    rows = np.random.default_rng(0).standard_normal((20_000, 3)).astype(np.float32)
+    assert digest_of(rows) == hashlib.sha256(rows.tobytes()).hexdigest()
 
 
 def test_a_run_without_a_whole_checkpoint_is_refused_and_left_alone(tmp_path):

@@ -16,7 +16,7 @@ from saclab.config import Config
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.data_set import read_data_set
 from saclab.environments.make import EnvironmentSpec
-from saclab.errors import SettingError, UserError, require
+from saclab.errors import SettingError, UserError, in_words, require
 from saclab.files import same_directory
 from saclab.records import Prefilled
 from saclab.replay import ReplayBuffer, RowLayout
@@ -29,7 +29,7 @@ from saclab.training.run_state import RunState
 
 FLATTENING = ("FlattenObservation", "FlattenAction")
 PART = 8192
-"""Rows whose observations are taken in at once."""
+"""Rows whose observations, or bytes, are taken in at once."""
 
 
 class Prefill(NamedTuple):
@@ -67,6 +67,16 @@ def read_prefill(config: Config, spec: EnvironmentSpec, layout: RowLayout) -> Pr
     if config.training.prefill_source is None:
         return None
     kind, name = config.training.prefill_source
+    try:
+        return read_source(config, spec, layout, kind, name)
+    except OSError as error:
+        raise SettingError(
+            "prefill", config.training.prefill, f"it cannot be read ({error.strerror or in_words(error)})"
+        ) from error
+
+
+def read_source(config: Config, spec: EnvironmentSpec, layout: RowLayout, kind: str, name: str) -> Prefill:
+    """What `read_prefill` gives for a source of this kind; raises OSError too."""
     if kind == "policy":
         return read_guide(config, spec, layout, Path(name))
     if kind == "minari":
@@ -80,10 +90,18 @@ def read_prefill(config: Config, spec: EnvironmentSpec, layout: RowLayout) -> Pr
         f"the first update would draw from {count} transitions of {config.training.prefill} and {random_steps} of the "
         f"run: use --batch-size {count + random_steps} or less, or --random-steps {batch - count} or more",
     )  # fmt: skip
-    record = Prefilled(count, hashlib.sha256(experience.rows.astype("<f4", copy=False).tobytes()).hexdigest())
+    record = Prefilled(count, digest_of(experience.rows))
     newest = f"the newest {count} of {experience.total}" if experience.total > count else f"{count}"
     told = f"begins with {newest} transition(s) of {config.training.prefill}, SHA-256 {record.sha256[:12]}…"
     return Prefill(experience.rows, None, record, [told, *experience.notes])
+
+
+def digest_of(rows: np.ndarray) -> str:
+    """The SHA-256 of rows as little-endian numbers, a part at a time: a large buffer is not copied for it."""
+    digest = hashlib.sha256()
+    for first in range(0, len(rows), PART):
+        digest.update(np.ascontiguousarray(rows[first : first + PART], "<f4").data)
+    return digest.hexdigest()
 
 
 def begin_with(prefill: Prefill, run: RunState) -> np.ndarray:
@@ -102,6 +120,8 @@ def begin_with(prefill: Prefill, run: RunState) -> np.ndarray:
         ended = np.asarray(batch.terminated > 0) | np.append(left, False)
         rewards = np.asarray(batch.reward_terms @ run.reward_weights())
         run.reward_scale.enter_stream(rewards, ended)
+    if environments == 1:
+        return rows
     in_place: np.ndarray = rows[side_by_side(len(rows), environments)]
     return in_place
 

@@ -208,6 +208,12 @@ def with_stable_prefill(training: TrainingSettings) -> TrainingSettings:
     kind, name = training.prefill_source or ("", "")
     if not kind or (kind == "minari" and not name.startswith(DATA_SET_PATHS)):
         return training
+    require(
+        kind == "minari" or not name.startswith("hf:"), "prefill", training.prefill,
+        "it takes folders of this machine: download the model first, with hf download "
+        f"{name[3:].replace('@', ' --revision ')} --local-dir model, then write {kind}:model "
+        f"(a folder of that name is {kind}:./{name})",
+    )  # fmt: skip
     return dataclasses.replace(training, prefill=f"{kind}:{absolute(os.path.expanduser(name))}")
 
 

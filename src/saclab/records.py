@@ -83,6 +83,10 @@ class Prefilled(Struct):
     sha256: Sha256
     """Of the transitions, or of the policy."""
 
+    def __str__(self) -> str:
+        what = f"{self.transitions} transitions" if self.transitions else "a policy"
+        return f"{what}, SHA-256 {self.sha256[:16]}"
+
 
 class RunDescription(Formatted, omit_defaults=True):
     """config.json."""

@@ -21,8 +21,9 @@ SECONDS_TO_OBEY = 8.0
 """A process that was asked to stop and saves nothing for so long is ended."""
 POLL_SECONDS = 0.1
 LAST_WORDS = (
-    f"saclab: asked to stop, and {SECONDS_TO_OBEY:g} seconds later neither saving nor at the end (a compilation, or a "
-    "step that takes long): ended. Nothing that was saved is lost, and the same command goes on from there\n"
+    f"saclab: asked to stop, and {SECONDS_TO_OBEY:g} seconds later neither saving nor at the end (a compilation, a "
+    "step that takes long, or reading what the run begins with): ended. Nothing that was saved is lost, "
+    "and the same command goes on from there\n"
 )
 SHOW_CURSOR = b"\x1b[?25h"  # a live display has hidden it
 PR_SET_PDEATHSIG = 1  # of Linux's prctl.h

@@ -125,9 +125,9 @@ def test_named_parts_are_flattened_as_the_wrapper_does_it(inside):
         assert found.action.shape == (4, 2)
 
 
-def test_actions_outside_the_bounds_are_clipped_and_told_of():
-    loose = gymnasium.wrappers.TransformAction(gymnasium.make("Pendulum-v1"), np.asarray, Box(-4, 4, (1,)))
-    record("pendulum/loose-v0", loose, 5, action=lambda step: np.array([step - 2.5], np.float32))
+def test_actions_outside_the_bounds_are_clipped_and_told_of(shelf):
+    record("pendulum/loose-v0", gymnasium.make("Pendulum-v1"), 5)
+    spoil(shelf / "pendulum/loose-v0", 0, "actions", lambda _: np.arange(5.0)[:, None] - 2.5)
     found = read("pendulum/loose-v0")
     np.testing.assert_allclose(found.transitions.action[:, 0], [-1, -0.75, -0.25, 0.25, 0.75])
     assert found.notes == [
@@ -135,9 +135,33 @@ def test_actions_outside_the_bounds_are_clipped_and_told_of():
     ]
 
 
+def test_actions_on_another_scale_are_refused_with_both_bounds():
+    """Read for Pendulum-v1, whose torque lies in [-2, 2], each of these would do half of what it did."""
+    scaled = gymnasium.wrappers.RescaleAction(gymnasium.make("Pendulum-v1"), np.float32(-1), np.float32(1))
+    record("pendulum/scaled-v0", scaled, 5)
+    with pytest.raises(SettingError, match=r"lie between \[-1.\] and \[1.\], and those of Pendulum-v1 between \[-2.\] "
+                       r"and \[2.\]: record it anew"):  # fmt: skip
+        read("pendulum/scaled-v0")
+
+
+@pytest.mark.parametrize("where", ["minari.MinariDataset.iterate_episodes", "numpy.concatenate"])
+def test_too_little_memory_is_told_with_the_way_out(monkeypatch, where):
+    """Whether it ends while episodes are read, or when they are joined."""
+
+    def exhausted(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(where, exhausted)
+    with pytest.raises(SettingError, match="take fewer, with --prefill-transitions"):
+        read(PENDULUM)
+
+
+gymnasium.register("PendulumTwin-v0", "gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=200)
+
+
 def test_another_environment_of_the_same_spaces_is_told_of():
-    found = read(PENDULUM, "environments.tiny:Counting-v0")
-    assert "is one of Pendulum-v1, and this run's is environments.tiny:Counting-v0" in found.notes[0]
+    found = read(PENDULUM, "PendulumTwin-v0")
+    assert "is one of Pendulum-v1, and this run's is PendulumTwin-v0" in found.notes[0]
 
 
 @pytest.mark.parametrize(

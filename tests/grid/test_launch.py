@@ -73,6 +73,9 @@ def test_a_grid_is_not_begun_without_what_its_runs_begin_with(tmp_path: Path) ->
     cells = make_grid(["Pendulum-v1"], ["sac"], "quick", 2, tmp_path, overrides={"prefill": "replay:/no/such/run"})
     with pytest.raises(UserError, match="/no/such/run is not a run folder"):
         require_startable(cells, 2, "--workers")
+    with pytest.raises(UserError, match="/no/such/run is not a run folder"):  # on this machine's device
+        require_startable(cells, 0, "--batch")
+    require_startable(cells, 0, "--workers", here=False)
 
 
 def test_a_status_takes_in_what_a_worker_says(tmp_path: Path) -> None:

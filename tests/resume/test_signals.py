@@ -180,7 +180,9 @@ def test_a_compilation_is_not_waited_for(tmp_path, monkeypatch):
     process = start(tmp_path, "train", "Pendulum-v1", *deep)
     wait_for(lambda: (tmp_path / RUN / "config.json").exists() or process.poll() is not None)
     time.sleep(2)  # what comes next is the program that makes the networks
-    assert "(a compilation, or a step that takes long): ended" in ended_in_time(process, signal.SIGTERM)
+    assert "(a compilation, a step that takes long, or reading what the run begins with): ended" in ended_in_time(
+        process, signal.SIGTERM
+    )
     assert not newest_first(tmp_path / RUN / "checkpoints")
     assert (tmp_path / RUN / "config.json").exists(), "the same command goes on from here, which is the beginning"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from contextlib import closing
 
 import gymnasium
@@ -14,14 +15,15 @@ from resume.helpers import finish, small_config, stop_at
 import saclab
 from saclab.errors import SettingError, UserError
 from saclab.protocols import make_config
-from saclab.records import read_json
+from saclab.records import Prefilled, read_json
 from saclab.replay import ReplayBuffer, RowLayout, Windows
 from saclab.training import loop
 from saclab.training.checkpoint import newest_first, read_checkpoint, save_checkpoint
 from saclab.training.events import Started
+from saclab.training.guide import Guide
 from saclab.training.local_engine import LocalBuilder, LocalEngine
 from saclab.training.manifest import Moment
-from saclab.training.prefill import begin_with, read_prefill, side_by_side
+from saclab.training.prefill import begin_with, digest_of, read_prefill, side_by_side
 from saclab.training.run_folder import read_run
 from saclab.training.run_state import RunState
 
@@ -177,6 +179,18 @@ def test_the_random_steps_are_acted_by_the_other_runs_policy(other):
         assert not engine.run.exploring()
 
 
+def test_a_policy_is_known_by_what_decides_how_it_acts(other):
+    """A learning rate, or a setting that a later version adds, leaves its digest as it is."""
+    policy, layout = saclab.load_policy(other), RowLayout(3, 1)
+
+    def digest(parameters=policy.parameters, **changes) -> str:
+        return Guide(dataclasses.replace(policy.settings, **changes), layout, parameters).sha256
+
+    assert digest() == digest(discount=0.5, critic_learning_rate=0.1)
+    others = digest(policy.parameters + 1), digest(log_std_minimum=-3.0), digest(log_std_bounding="tanh")
+    assert len({digest(), *others}) == 4
+
+
 def test_a_policy_of_another_task_is_told_of(other):
     config = dataclasses.replace(prefilled(f"policy:{other}"), environment_arguments={"g": 9.0})
     builder = LocalBuilder(config)
@@ -202,6 +216,19 @@ def test_a_policy_of_another_task_is_told_of(other):
 def test_settings_that_cannot_be_are_refused(changes, said):
     with pytest.raises(SettingError, match=said):
         small_config("Pendulum-v1", "sac", **changes)
+
+
+def test_a_model_on_the_hub_has_to_be_downloaded_first():
+    with pytest.raises(
+        SettingError, match=r"prefill = 'policy:hf:ada/x@v1': .* with hf download ada/x --revision v1 --local-"
+    ):
+        make_config("Pendulum-v1", overrides={"prefill": "policy:hf:ada/x@v1"})
+    assert make_config("Pendulum-v1", overrides={"prefill": "policy:./hf:x"}).training.prefill.endswith("/hf:x")
+
+
+def test_a_policy_is_told_as_one():
+    assert str(Prefilled(0, "a" * 64)) == "a policy, SHA-256 aaaaaaaaaaaaaaaa"
+    assert str(Prefilled(3, "a" * 64)) == "3 transitions, SHA-256 aaaaaaaaaaaaaaaa"
 
 
 def test_paths_do_not_depend_on_the_working_directory(tmp_path, monkeypatch):
@@ -235,10 +262,35 @@ def test_other_runs_that_do_not_fit_are_refused(other, tmp_path):
     assert "its observations have 3 numbers, and this run's have 2" in said
     bounded = prefilled(f"policy:{other}", "environments.tiny:Counting-v0")
     assert "its actions lie between [-2.] and [2.], and this run's between [-1.] and [1.]" in refusal(bounded, own)
+    bounded = prefilled(f"replay:{other}", "environments.tiny:Counting-v0")
+    assert "its actions lie between [-2.] and [2.], and this run's between [-1.] and [1.]" in refusal(bounded, own)
     terms = prefilled(f"replay:{other}", "HalfCheetah-v4", reward_terms=("reward_run",))
     assert "its reward_terms are (), and this run's are ('reward_run',)" in refusal(terms, own)
     terms = prefilled(f"minari:{PENDULUM}", "HalfCheetah-v4", reward_terms=("reward_run",))
     assert "a Minari data set tells rewards and not their terms" in refusal(terms, own)
+
+
+@pytest.mark.parametrize("source", ["minari", "replay", "policy"])
+def test_a_source_that_cannot_be_read_is_named_and_not_the_run(tmp_path, source):
+    """A loop of links raises an OSError whoever asks."""
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    said = refusal(prefilled(f"{source}:{tmp_path / 'loop' / 'x'}"), tmp_path / "own")
+    assert f"{tmp_path / 'loop'}" in said
+    assert "cannot write to" not in said
+
+
+def test_an_error_of_the_disk_is_one_of_the_prefill(tmp_path, monkeypatch):
+    def broken(*_):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr("saclab.training.prefill.read_config", broken)
+    said = refusal(prefilled("replay:/broken"), tmp_path / "own")
+    assert said == "prefill = 'replay:/broken': it cannot be read (Input/output error)"
+
+
+def test_the_digest_in_parts_is_that_of_the_whole():
+    rows = np.random.default_rng(0).standard_normal((20_000, 3)).astype(np.float32)
+    assert digest_of(rows) == hashlib.sha256(rows.tobytes()).hexdigest()
 
 
 def test_a_run_without_a_whole_checkpoint_is_refused_and_left_alone(tmp_path):
@@ -256,6 +308,18 @@ def test_a_run_without_a_whole_checkpoint_is_refused_and_left_alone(tmp_path):
         path.unlink()
     checkpoint.rmdir()
     assert "it has none: let that run go on until it saves" in refusal(config, own)
+
+
+def test_a_run_that_does_not_tell_its_action_bounds_is_told_of(tmp_path):
+    """One that was stopped before its first evaluation has no policy yet."""
+    stop_at(40, small_config("Pendulum-v1", "sac"), tmp_path)
+    config = prefilled(f"replay:{tmp_path}")
+    builder = LocalBuilder(config)
+    told = read_prefill(config, builder.spec, builder.layout).notes
+    assert (
+        told[-1]
+        == f"whether the actions of replay:{tmp_path} have this run's bounds is not known: it has no readable policy"
+    )
 
 
 def test_a_replay_with_what_is_not_finite_is_refused_with_its_place(tmp_path):
@@ -290,8 +354,8 @@ def test_a_run_that_has_to_begin_anew_begins_with_the_same_or_not_at_all(shelf, 
 
     minari.delete_dataset(name)
     record(name, gymnasium.make("Pendulum-v1"), 51)
-    with pytest.raises(UserError, match=r"has begun with another prefill 'minari:.*it had 50 transitions with the SHA-"
-                       r"256 .*, and has 51 transitions with"):  # fmt: skip
+    with pytest.raises(UserError, match=r"has begun with another prefill 'minari:.*it had 50 transitions, SHA-256 .* "
+                       r"then, and has 51 transitions, SHA"):  # fmt: skip
         list(loop.train(config, tmp_path))
 
 

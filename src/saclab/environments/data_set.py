@@ -62,7 +62,8 @@ def read_data_set(name: str, environment: CheckedEnvironment, most: int) -> Data
         total = int(data.total_steps)
     if not count:
         raise refused(name, "it holds no transitions")
-    joined = Transitions(*map(np.concatenate, zip(*reversed(episodes), strict=True)))
+    with reading(name):
+        joined = Transitions(*map(np.concatenate, zip(*reversed(episodes), strict=True)))
     return DataSet(Transitions(*(part[-most:] for part in joined)), total, reader.notes())
 
 
@@ -86,8 +87,14 @@ def reading(name: str) -> Iterator[None]:
         yield
     except UserError:
         raise
+    except MemoryError as error:
+        raise no_memory(name) from error
     except Exception as error:
         raise refused(name, f"Minari cannot read it ({in_words(error)})") from error
+
+
+def no_memory(name: str) -> SettingError:
+    return refused(name, "there is no memory for its transitions: take fewer, with --prefill-transitions")
 
 
 def refused(name: str, reason: str) -> SettingError:
@@ -120,6 +127,18 @@ class EpisodeReader:
             raise self._unlike("observation", inner.observation_space)
         if flat_size(self.action_space) != self.spec.action_size:
             raise self._unlike("action", inner.action_space)
+        self._require_same_bounds()
+
+    def _require_same_bounds(self) -> None:
+        """Refuse actions on another scale, such as those recorded through RescaleAction: they would do other things."""
+        low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)
+        if not (np.allclose(low, self.spec.action_low) and np.allclose(high, self.spec.action_high)):
+            raise refused(
+                self.name,
+                f"its actions lie between {low} and {high}, and those of {self.environment.name} between "
+                f"{self.spec.action_low} and {self.spec.action_high}: record it anew without a wrapper that rescales "
+                "actions, or train in an environment registered with that wrapper",
+            )
 
     def _unlike(self, what: str, here: Any) -> SettingError:
         there = getattr(self.data, f"{what}_space")

@@ -100,7 +100,7 @@ def seed_numbers(seeds: int | Sequence[int] | None, protocol: str, first: int = 
 
 
 @same_directory()
-def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
+def require_startable(cells: Sequence[Cell], at_once: int, fewer: str, here: bool = True) -> None:
     """Raise UserError before anything is started if an environment, a folder or the memory will not do.
 
     The runs of one environment need not be of one size: a variant's row may say another capacity of the replay buffer,
@@ -108,8 +108,9 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
 
     Args:
         cells: the grid.
-        at_once: runs that this machine's memory must hold together; 0 if they are trained elsewhere.
+        at_once: runs that this machine's memory must hold together; 0 if they are trained elsewhere or on a device.
         fewer: the option that would lower their number.
+        here: whether they are trained on this machine, which then must have what they begin with.
     """
     from saclab.environments.checked import CheckedEnvironment
     from saclab.memory import needed_memory, require_memory
@@ -132,6 +133,7 @@ def require_startable(cells: Sequence[Cell], at_once: int, fewer: str) -> None:
         needed[sum(needed_memory(config, layout))] = config, layout
     if at_once:
         require_memory(*needed[max(needed)], at_once, fewer)
+    if here:
         require_prefill_there(cells, specs)
 
 

@@ -43,7 +43,7 @@ class Resources(NamedTuple):
     def require_startable(self, cells: Sequence[Cell]) -> None:
         """Raise UserError before anything is started if an environment, a folder or the memory will not do."""
         if self.cluster is not None:
-            require_startable(cells, 0, "--workers")  # the memory of its machines is not this one's
+            require_startable(cells, 0, "--workers", here=False)  # its machines have memory and files of their own
         elif not self.batch:
             assert self.workers is not None
             require_startable(cells, min(self.workers, len(cells)), "--workers")

@@ -105,10 +105,7 @@ def conditions(run: RunRecord) -> dict[str, Any]:
 
 def prefill_told(run: RunRecord) -> dict[str, str]:
     """What a run began with, by its content, in place of the setting's text: its place may be another one elsewhere."""
-    if run.prefill is None:
-        return {}
-    what = f"{run.prefill.transitions} transitions" if run.prefill.transitions else "a policy"
-    return {"prefill": f"{what}, SHA-256 {run.prefill.sha256[:16]}"}
+    return {} if run.prefill is None else {"prefill": str(run.prefill)}
 
 
 def own_training(config: Config) -> TrainingSettings | None:

@@ -20,6 +20,10 @@ from saclab.training.checkpoint import Arrays
 from saclab.training.learners import learner_of
 from saclab.training.manifest import CheckpointError
 
+ACTING = ("network", "hidden_layers", "activation", "weight_projection", "observation_normalisation", "log_std_minimum",
+          "log_std_maximum", "log_std_bounding")  # fmt: skip
+"""The settings that decide how a policy acts. Moments of observations are among its parameters."""
+
 
 class Guide:
     """A policy, as it lies in the checkpoints of a run until the random steps are over."""
@@ -27,6 +31,7 @@ class Guide:
     def __init__(self, settings: AlgorithmSettings, layout: RowLayout, parameters: np.ndarray) -> None:
         """`settings` are those of its own run, `parameters` f32[P]."""
         self.settings, self.parameters = settings, parameters
+        self.sizes = layout.columns["observation"], layout.columns["action"]
         self.policy = learner_of(settings, layout).policy
 
     def act(self, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -36,9 +41,11 @@ class Guide:
 
     @property
     def sha256(self) -> str:
-        """Of all that decides how it acts."""
-        settings = json.dumps(self.capture()[0], sort_keys=True).encode()
-        return hashlib.sha256(settings + self.parameters.tobytes()).hexdigest()
+        """Of what decides how it acts, and of no other setting: one that a later version adds leaves it as it is."""
+        told = {name: getattr(self.settings, name) for name in ACTING} | {"sizes": self.sizes}
+        digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode())
+        digest.update(self.parameters.astype("<f4", copy=False).tobytes())
+        return digest.hexdigest()
 
     def capture(self) -> tuple[dict[str, Any], Arrays]:
         """Its settings and its parameters."""

@@ -16,7 +16,7 @@ from saclab.config import Config
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.data_set import read_data_set
 from saclab.environments.make import EnvironmentSpec
-from saclab.errors import SettingError, require
+from saclab.errors import SettingError, UserError, in_words, require
 from saclab.files import same_directory
 from saclab.records import Prefilled
 from saclab.replay import ReplayBuffer, RowLayout
@@ -29,7 +29,7 @@ from saclab.training.run_state import RunState
 
 FLATTENING = ("FlattenObservation", "FlattenAction")
 PART = 8192
-"""Rows whose observations are taken in at once."""
+"""Rows whose observations, or bytes, are taken in at once."""
 
 
 class Prefill(NamedTuple):
@@ -67,9 +67,22 @@ def read_prefill(config: Config, spec: EnvironmentSpec, layout: RowLayout) -> Pr
     if config.training.prefill_source is None:
         return None
     kind, name = config.training.prefill_source
+    try:
+        return read_source(config, spec, layout, kind, name)
+    except OSError as error:
+        raise SettingError(
+            "prefill", config.training.prefill, f"it cannot be read ({error.strerror or in_words(error)})"
+        ) from error
+
+
+def read_source(config: Config, spec: EnvironmentSpec, layout: RowLayout, kind: str, name: str) -> Prefill:
+    """What `read_prefill` gives for a source of this kind; raises OSError too."""
     if kind == "policy":
         return read_guide(config, spec, layout, Path(name))
-    experience = read_minari(config, layout, name) if kind == "minari" else read_replay(config, layout, Path(name))
+    if kind == "minari":
+        experience = read_minari(config, layout, name)
+    else:
+        experience = read_replay(config, spec, layout, Path(name))
     count, random_steps = len(experience.rows), config.training.random_steps
     batch = config.algorithm.batch_size
     require(
@@ -77,10 +90,18 @@ def read_prefill(config: Config, spec: EnvironmentSpec, layout: RowLayout) -> Pr
         f"the first update would draw from {count} transitions of {config.training.prefill} and {random_steps} of the "
         f"run: use --batch-size {count + random_steps} or less, or --random-steps {batch - count} or more",
     )  # fmt: skip
-    record = Prefilled(count, hashlib.sha256(experience.rows.astype("<f4", copy=False).tobytes()).hexdigest())
+    record = Prefilled(count, digest_of(experience.rows))
     newest = f"the newest {count} of {experience.total}" if experience.total > count else f"{count}"
     told = f"begins with {newest} transition(s) of {config.training.prefill}, SHA-256 {record.sha256[:12]}…"
     return Prefill(experience.rows, None, record, [told, *experience.notes])
+
+
+def digest_of(rows: np.ndarray) -> str:
+    """The SHA-256 of rows as little-endian numbers, a part at a time: a large buffer is not copied for it."""
+    digest = hashlib.sha256()
+    for first in range(0, len(rows), PART):
+        digest.update(np.ascontiguousarray(rows[first : first + PART], "<f4").data)
+    return digest.hexdigest()
 
 
 def begin_with(prefill: Prefill, run: RunState) -> np.ndarray:
@@ -99,6 +120,8 @@ def begin_with(prefill: Prefill, run: RunState) -> np.ndarray:
         ended = np.asarray(batch.terminated > 0) | np.append(left, False)
         rewards = np.asarray(batch.reward_terms @ run.reward_weights())
         run.reward_scale.enter_stream(rewards, ended)
+    if environments == 1:
+        return rows
     in_place: np.ndarray = rows[side_by_side(len(rows), environments)]
     return in_place
 
@@ -145,7 +168,7 @@ def read_minari(config: Config, layout: RowLayout, name: str) -> Experience:
 # --- another run
 
 
-def read_replay(config: Config, layout: RowLayout, folder: Path) -> Experience:
+def read_replay(config: Config, spec: EnvironmentSpec, layout: RowLayout, folder: Path) -> Experience:
     """The newest transitions in the newest whole checkpoint of another run, which is only read.
 
     Raises:
@@ -175,7 +198,33 @@ def read_replay(config: Config, layout: RowLayout, folder: Path) -> Experience:
         number = np.concatenate(streams)[row]
         raise SettingError("prefill", config.training.prefill, f"a number of transition {number} is not finite")
     notes = other_task(config, other.environment, other.environment_arguments, other.training.wrappers)
-    return Experience(rows, buffer.size, notes)
+    return Experience(rows, buffer.size, [*notes, *bounds_notes(config, spec, folder)])
+
+
+def bounds_notes(config: Config, spec: EnvironmentSpec, folder: Path) -> list[str]:
+    """A note if another run does not tell the bounds of its actions, which its replay buffer holds in [-1, 1].
+
+    Raises:
+        SettingError: if its policy tells other ones than this run's.
+    """
+    try:
+        there = load_policy(folder / "best").spec
+    except UserError:
+        name = config.training.prefill
+        return [f"whether the actions of {name} have this run's bounds is not known: it has no readable policy"]
+    if there.action_size == spec.action_size:
+        require_same_bounds(config, spec, there)
+    return []
+
+
+def require_same_bounds(config: Config, spec: EnvironmentSpec, there: EnvironmentSpec) -> None:
+    """Refuse another run whose actions have other bounds, `there`: they would do other things."""
+    require(
+        np.array_equal(there.action_low, spec.action_low) and np.array_equal(there.action_high, spec.action_high),
+        "prefill", config.training.prefill,
+        f"its actions lie between {there.action_low} and {there.action_high}, and this run's between "
+        f"{spec.action_low} and {spec.action_high}",
+    )  # fmt: skip
 
 
 def replay_in(path: Path, other: Config, layout: RowLayout, config: Config) -> ReplayBuffer:
@@ -206,12 +255,7 @@ def read_guide(config: Config, spec: EnvironmentSpec, layout: RowLayout, folder:
     for name, sizes in {"observations": "observation_size", "actions": "action_size"}.items():
         here, other = getattr(spec, sizes), getattr(there, sizes)
         require(here == other, "prefill", prefill, f"its {name} have {other} numbers, and this run's have {here}")
-    require(
-        np.array_equal(there.action_low, spec.action_low) and np.array_equal(there.action_high, spec.action_high),
-        "prefill", prefill,
-        f"its actions lie between {there.action_low} and {there.action_high}, and this run's between "
-        f"{spec.action_low} and {spec.action_high}",
-    )  # fmt: skip
+    require_same_bounds(config, spec, there)
     guide = Guide(policy.settings, layout, policy.parameters)
     told = f"the policy of {folder} acts in the first {config.training.random_steps} steps"
     notes = other_task(config, description.environment, description.environment_arguments, description.wrappers)

@@ -12,7 +12,7 @@ from saclab.config import Config
 from saclab.errors import UserError
 from saclab.files import write_json
 from saclab.machine import different_facts, other_simulation
-from saclab.records import FileRecord, Prefilled, RunDescription, read_json
+from saclab.records import FileRecord, RunDescription, read_json
 from saclab.replay import RowLayout
 from saclab.training.checkpoint import Checkpoint
 from saclab.training.common_checkpoint import read_common
@@ -78,13 +78,9 @@ def begin_folder(folder: Path, config: Config, facts: dict[str, Any], prefill: P
         write_json(path, RunDescription(FORMAT, config.to_dict(), **facts, prefill=record))
     elif (before := read_json(path, RunDescription).prefill) != record:
         raise UserError(
-            f"{folder} has begun with another prefill {config.training.prefill!r}: it had {told(before)} then, and "
-            f"has {told(record)} now: bring back what it was, or give this run a name of its own with --name"
+            f"{folder} has begun with another prefill {config.training.prefill!r}: it had {before or 'none'} then, and "
+            f"has {record or 'none'} now: bring back what it was, or give this run a name of its own with --name"
         )
-
-
-def told(record: Prefilled | None) -> str:
-    return "none" if record is None else f"{record.transitions} transitions with the SHA-256 {record.sha256[:12]}…"
 
 
 def begun_with(prefill: Prefill | None, builder: EngineBuilder, run: int, notes: list[str]) -> Beginning:

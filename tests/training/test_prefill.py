@@ -204,7 +204,7 @@ def test_a_policy_of_another_task_is_told_of(other):
         ({"prefill": "minari"}, "prefill = 'minari': write minari:DATASET-ID, replay:RUN-FOLDER or policy:RUN-FOLDER"),
         ({"prefill": "minari:"}, "prefill = 'minari:': write"),
         ({"prefill": ""}, "prefill = '': write"),
-        ({"prefill": 3}, "prefill = 3: write"),
+        ({"prefill": 3}, "prefill = 3: Expected"),
         ({"prefill": "pickle:x"}, "prefill = 'pickle:x': write"),
         ({"prefill": "policy:x", "random_steps": 0, "batch_size": 1}, "use --random-steps 1 or more"),
         ({"prefill": "policy:x", "random_steps": 3}, "batch_size = 32: the first update would draw"),

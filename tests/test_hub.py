@@ -11,8 +11,11 @@ import pytest
 from hub_server import served
 
 from saclab import hub
-from saclab.errors import UserError
-from saclab.sharing.private import require_no_paths
+from saclab.errors import UserError, for_terminal
+from saclab.hub import require_own
+from saclab.protocols import make_config
+from saclab.records import Prefilled
+from saclab.sharing.private import public_config, require_no_paths
 from saclab.trained_policy import on_disk
 
 
@@ -60,7 +63,7 @@ def test_no_connection_is_one_line(monkeypatch: pytest.MonkeyPatch, action: Call
 @pytest.mark.parametrize(
     "text",
     ["/home/ada/robot.xml", "~/robot.xml", "~ada/robot.xml", r"C:\robots\one.xml", "C:/robots", r"\\server\share",
-     "file:robot.xml", "file:///home/ada", "--model=/data/x", f"{Path.home()}"],
+     "file:robot.xml", "file:///home/ada", "//server/share/x", "/-x/y", "replay:/home/ada/runs/a", "--model=/data/x", f"{Path.home()}"],
 )  # fmt: skip
 def test_paths_of_a_machine_are_seen_anywhere(text: str) -> None:
     for values in ({"arguments": {"deep": [1, text]}}, {"arguments": {text: 1}}):
@@ -71,7 +74,24 @@ def test_paths_of_a_machine_are_seen_anywhere(text: str) -> None:
 @pytest.mark.parametrize(
     "text",
     ["HalfCheetah-v4", "dm_control/cheetah-run-v0", "shimmy:dm_control/x-v0", "own:last_four", "assets/robot.xml",
-     "https://example.org/robot.xml", "ant_with_goal.xml", "1/2", "a ~ b", ""],
+     "https://example.org/robot.xml", "-1330.2 +/- 223.4", "ant_with_goal.xml", "1/2", "a ~ b", ""],
 )  # fmt: skip
 def test_names_and_addresses_are_no_paths(text: str) -> None:
     require_no_paths({"environment": text, "arguments": [text]})
+
+
+def test_what_a_run_began_with_is_published_by_its_content() -> None:
+    config = make_config("Pendulum-v1", overrides={"prefill": "replay:/home/ada/runs/a"})
+    public = public_config(config, Prefilled(100, "ab" * 32))
+    assert public.training.prefill == f"replay:{'ab' * 32}"
+    require_no_paths(public.to_dict())
+    assert public_config(config, None) == config, "there is nothing to name it by"
+    by_id = make_config("Pendulum-v1", overrides={"prefill": "minari:mujoco/hopper/expert-v0"})
+    assert public_config(by_id, Prefilled(100, "ab" * 32)) == by_id
+
+
+def test_what_strangers_write_reaches_the_terminal_without_control_characters() -> None:
+    with pytest.raises(UserError) as told:
+        require_own("user/name", {"\x1b[2Jevil\n"}, {"policy.json"})
+    assert for_terminal(told.value, str(told.value)).isprintable()
+    assert for_terminal(UserError(""), "one\x1b[2J\ntwo") == "saclab: one\ufffd[2J\ntwo"

@@ -74,6 +74,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
 MESSAGE_LETTERS, LINE_LETTERS = 300, 200
 LAST_FRAMES, LAST_LINES = 2, 12
 TRACEBACK_LETTERS = 1_000_000
+LAST_LINE_LETTERS = 20_000
 
 
 def in_words(error: BaseException) -> str:
@@ -103,7 +104,8 @@ def for_terminal(error: BaseException, line: str) -> str:
     lines = getattr(error, "traceback", "").splitlines()
     frames = [number for number, line in enumerate(lines) if line.startswith("  File ")][-LAST_FRAMES:]
     last = lines[frames[0] if frames else 0 :][:LAST_LINES]
-    return "\n".join([*(printable(each, LINE_LETTERS) for each in last), f"saclab: {line}"])
+    own = [printable(each, LAST_LINE_LETTERS) for each in f"saclab: {line}".splitlines()]
+    return "\n".join([*(printable(each, LINE_LETTERS) for each in last), *own])
 
 
 def printable(line: str, letters: int) -> str:

@@ -11,15 +11,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from saclab.errors import UserError, in_words, require
+from saclab.errors import UserError, in_words, printable, require, shown
 from saclab.extras import required
 
 SCHEME = "hf:"
 FORM = f"{SCHEME}user/name or {SCHEME}user/name@revision"
 LOG_IN = "make one that may write at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN"
+LONGEST_ANSWER = 500
 OFFLINE = "with HF_HUB_OFFLINE=1 what has been downloaded before is used as it is"
-BY_THE_HUB = {".gitattributes", "README.md"}
-"""What a repository may hold that was made on the Hub's own page."""
+BY_THE_HUB = {".gitattributes"}
+"""What every repository holds. A README.md may be somebody's own words, and is not replaced."""
 
 
 class Address(NamedTuple):
@@ -75,11 +76,15 @@ def download(address: Path | str, largest: Mapping[str, int]) -> Path:
     """
     hub = library()
     repository, revision = parsed(address)
+    found = None
     with told(repository, revision):
         with suppress(hub.errors.OfflineModeIsEnabled):
             found = hub.HfApi().model_info(repository, revision=revision, files_metadata=True)
             require_files(str(address), {file.rfilename: file.size for file in found.siblings or ()}, largest)
-        return Path(hub.snapshot_download(repository, revision=revision, allow_patterns=list(largest)))
+        folder = Path(hub.snapshot_download(repository, revision=revision, allow_patterns=list(largest)))
+    if found is not None and folder.name != found.sha:
+        raise UserError(f"{address} has changed while it was looked at: give the same command again")
+    return folder
 
 
 def require_files(address: str, sizes: Mapping[str, int | None], largest: Mapping[str, int]) -> None:
@@ -120,9 +125,10 @@ def upload(
             `private` is asked for, or holds another model.
     """
     hub = library()
+    api = hub.HfApi()
     with told(repository, None):
-        api = hub.HfApi()
         page = str(api.create_repo(repository, private=private or None, exist_ok=True))
+    with nothing_sent(repository), told(repository, None):
         there = api.model_info(repository)
         names = {file.rfilename for file in there.siblings or ()}
         require_own(repository, names, marks)
@@ -137,12 +143,22 @@ def upload(
     return page
 
 
+@contextmanager
+def nothing_sent(repository: str) -> Iterator[None]:
+    """Add to an error that the repository is there all the same."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{error} (nothing was sent; if there was no {repository} before, it is there now)") from error
+
+
 def require_own(repository: str, names: Set[str], marks: Set[str]) -> None:
     """Refuse to write into another model, whose card at least would be replaced."""
     others = names - BY_THE_HUB
     if others and not marks <= names:
         raise UserError(
-            f"{repository} is there already and holds another model (it has {min(others)}): name another repository"
+            f"{repository} is there already and holds something else (it has {shown(min(others))}): name another "
+            "repository, or remove that first"
         )
 
 
@@ -182,5 +198,5 @@ def refusal(repository: str, at: str, error: Any) -> str:
             return f"{repository}: {at} refuses the token: {LOG_IN}"
         case 403:
             return f"{repository}: {at} does not let this token do that: is the name yours? Else {LOG_IN}"
-    said = getattr(error, "server_message", None) or in_words(error)
+    said = printable(str(getattr(error, "server_message", None) or in_words(error)), LONGEST_ANSWER)
     return f"{repository}: {at} answered {status} ({said})"

@@ -45,17 +45,22 @@ class EvaluationResult(NamedTuple):
 
 
 def evaluate(
-    run: Path, episodes: int, seed: int, deterministic: bool = True, imports: Sequence[str] = ()
+    run: Path,
+    episodes: int,
+    seed: int,
+    deterministic: bool = True,
+    imports: Sequence[str] = (),
+    left_in: Path | None = None,
 ) -> EvaluationResult:
     """Evaluate the best policy of a run, from its folder or from the Hugging Face Hub.
 
     Raises:
         UserError: if the run has no policy, or its environment would import a package not named in `imports`.
-        RunBroken: if the environment raises an error, or breaks its word; a traceback is left in `run`, or in the
-            working directory if that is hf:user/name.
+        RunBroken: if the environment raises an error, or breaks its word; a traceback is left in `left_in`; None for
+            `run`, or for the working directory if that is hf:user/name.
     """
     require_seed(seed)
-    run, left_in = on_disk(run), for_tracebacks(run)
+    run, left_in = on_disk(run), left_in or for_tracebacks(run)
     policy, description = load_policy(run), read_description(run)
     require_import_allowed(description.environment, description.wrappers, imports)
     seeds = np.random.SeedSequence(seed).generate_state(episodes).tolist()
@@ -90,19 +95,27 @@ def require_fit(policy: TrainedPolicy, environment: str, spec: EnvironmentSpec) 
             raise UserError(f"the policy is not one for {environment}: its {name} is {own}, and there it is {there}")
 
 
-def record(run: Path, video: Path, steps: int, seed: int, size: int, imports: Sequence[str] = ()) -> str:
+def record(
+    run: Path,
+    video: Path,
+    steps: int,
+    seed: int,
+    size: int,
+    imports: Sequence[str] = (),
+    left_in: Path | None = None,
+) -> str:
     """Film the best policy from the start of an episode, at the environment's own speed; says what was filmed.
 
     Raises:
         UserError: if the run has no policy, its environment would import a package not named in `imports`, or cannot
             be rendered here.
-        RunBroken: if the environment raises an error, or breaks its word; a traceback is left in `run`, or in the
-            working directory if that is hf:user/name.
+        RunBroken: if the environment raises an error, or breaks its word; a traceback is left in `left_in`; None for
+            `run`, or for the working directory if that is hf:user/name.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     require_seed(seed)
-    run, left_in = on_disk(run), for_tracebacks(run)
+    run, left_in = on_disk(run), left_in or for_tracebacks(run)
     policy, description = load_policy(run), read_description(run)
     given, video = video, absolute(video)
     require_import_allowed(description.environment, description.wrappers, imports)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,10 +10,11 @@ from typing import Any
 
 import msgspec
 
+from saclab.config import Config
 from saclab.errors import UserError
-from saclab.records import Result, RunDescription
+from saclab.records import Prefilled, Result, RunDescription
 
-ABSOLUTE_PATH = re.compile(r"(?<![\w./])(~?/[\w.]|~\w+/|[A-Za-z]:[\\/]|\\\\\w)|\bfile:")
+ABSOLUTE_PATH = re.compile(r"(?<![\w./])(~?/(?:[\w.~]|-\w)|(?<!:)//[\w.-]|~\w+/|[A-Za-z]:[\\/]|\\\\\w)|\bfile:")
 """Absolute paths of any system, ~/…, and file:…, anywhere in a text; not https://…, package.module:Name or a/b."""
 
 
@@ -41,8 +43,21 @@ def require_no_paths(values: Any) -> None:
 
 
 def public_description(description: RunDescription) -> RunDescription:
-    """config.json without the machine: its processor, its system, its cores, its environment variables."""
-    return msgspec.structs.replace(description, machine={})
+    """config.json without the machine: its processor, its system, its cores, its environment variables.
+
+    What the run began with is told by its content, not by where it lay.
+    """
+    config = public_config(Config.from_dict(description.config), description.prefill).to_dict()
+    return msgspec.structs.replace(description, machine={}, config=config)
+
+
+def public_config(config: Config, prefill: Prefilled | None) -> Config:
+    """A configuration whose prefill is named by the SHA-256 of its content, where it is a path."""
+    kind, place = config.training.prefill_source or ("", "")
+    if prefill is None or not ABSOLUTE_PATH.search(place):
+        return config
+    named = dataclasses.replace(config.training, prefill=f"{kind}:{prefill.sha256}")
+    return dataclasses.replace(config, training=named)
 
 
 def public_result(result: Result) -> Result:

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import msgspec
 
-from saclab.errors import SettingError, require
+from saclab.errors import SettingError, UserError, require
 from saclab.files import replace_file, write_json
 from saclab.hub import require_name, require_token, upload
 from saclab.playback import evaluate, record
 from saclab.records import is_there, read_bytes
 from saclab.sharing.model_card import VIDEO, Card
-from saclab.sharing.private import public_description, public_result, require_no_paths
-from saclab.trained_policy import POLICY_BYTES, policy_folder
+from saclab.sharing.private import public_config, public_description, public_result, require_no_paths
+from saclab.trained_policy import POLICY_BYTES, load_policy, policy_folder
 from saclab.trained_policy import read_description as read_policy_description
 from saclab.training.logs import OF_TERMS
 from saclab.training.run_folder import RunRecord, read_description, read_result, read_run
 
 CARD, ONNX = "README.md", "policy.onnx"
 RESULTS = ("config.json", "result.json", "evaluations.csv", OF_TERMS)
+TEXTS = (".json", ".md")
+ATTEMPTS = 3
 FILM_STEPS, FILM_SIZE = 1000, 320
 """Of a film that is made for sharing: an episode of most environments, in steps; pixels."""
 
@@ -71,17 +72,24 @@ def share(
     require_name(repository)
     require_fresh(folder) if folder is not None else require_token()
     found = read_run(run)
+    found = found._replace(config=public_config(found.config, found.prefill))
     if not paths_too:
         require_no_paths(found.config.to_dict() | msgspec.to_builtins(read_policy_description(run)))
-    tell(f"evaluating the best policy on {episodes} fresh episodes …")
-    card = Card(repository, found, evaluate(run, episodes, seed, imports=imports), seed, imports, license)
-    with collected(run, card, video, onnx, tell) as files:
+    with TemporaryDirectory(prefix="saclab-share-") as name:
+        copy = Path(name)
+        copy_policy(run, copy)  # what is sent is what is evaluated, whatever a run that goes on finds meanwhile
+        tell(f"evaluating the best policy on {episodes} fresh episodes …")
+        score = evaluate(copy, episodes, seed, imports=imports, left_in=run)
+        card = Card(repository, found, score, seed, imports, license)
+        files = collect(run, copy, card, video, onnx, tell)
+        if not paths_too:
+            require_no_paths({name: path.read_text() for name, path in files.items() if path.suffix in TEXTS})
         tell("\n".join(f"  {path.name:<20} {path.stat().st_size:>12,} bytes" for path in files.values()))
         if folder is not None:
             return str(written(files, folder))
-        tell(f"sending these to {repository}{', which only you will see' if private else ', for everybody to see'} …")
-        config = found.config
-        message = f"{config.variant} on {config.environment}, trained and shared by saclab"
+        seen = "which only you will see" if private else "for everybody to see, unless the repository is private"
+        tell(f"sending these to {repository}, {seen} …")
+        message = f"{found.config.variant} on {found.config.environment}, trained and shared by saclab"
         return upload(repository, files, POLICY_BYTES.keys(), {VIDEO, ONNX, *RESULTS}, private, message)
 
 
@@ -91,22 +99,31 @@ def require_fresh(folder: Path) -> None:
         raise SettingError("folder", str(folder), "there is something already: name a new folder")
 
 
-@contextmanager
-def collected(run: Path, card: Card, video: bool, onnx: bool, tell: Tell) -> Iterator[dict[str, Path]]:
-    """All that is shared, by name, in a folder that is gone afterwards."""
-    with TemporaryDirectory(prefix="saclab-share-") as name:
-        folder = Path(name)
-        for file in POLICY_BYTES:
-            replace_file(folder / file, read_bytes(policy_folder(run) / file))
-        copy_results(run, card.run, folder)
-        add_film(run, folder, video, card, tell)
-        if onnx:
-            from saclab.onnx_export import export_onnx
+def copy_policy(run: Path, folder: Path) -> None:
+    """Copy the two files of a policy, which belong together, from a run that may find a better one meanwhile."""
+    for attempt in range(ATTEMPTS):
+        for name in POLICY_BYTES:
+            replace_file(folder / name, read_bytes(policy_folder(run) / name))
+        try:
+            load_policy(folder)
+            return
+        except UserError:
+            if attempt + 1 == ATTEMPTS:
+                load_policy(run)  # says what is wrong there
+                raise
 
-            export_onnx(folder, folder / ONNX)
-        names = [path.name for path in folder.iterdir()]
-        replace_file(folder / CARD, card.text(names).encode())
-        yield {file: folder / file for file in sorted([*names, CARD])}
+
+def collect(run: Path, folder: Path, card: Card, video: bool, onnx: bool, tell: Tell) -> dict[str, Path]:
+    """All that is shared, by name, put beside the policy in a folder."""
+    copy_results(run, card.run, folder)
+    add_film(run, folder, video, card, tell)
+    if onnx:
+        from saclab.onnx_export import export_onnx
+
+        export_onnx(folder, folder / ONNX)
+    names = [path.name for path in folder.iterdir()]
+    replace_file(folder / CARD, card.text(names).encode())
+    return {file: folder / file for file in sorted([*names, CARD])}
 
 
 def copy_results(run: Path, found: RunRecord, folder: Path) -> None:
@@ -125,7 +142,7 @@ def add_film(run: Path, folder: Path, anew: bool, card: Card, tell: Tell) -> Non
     filmed = best / "video.mp4"
     if anew:
         tell("filming an episode …")
-        record(folder, folder / VIDEO, FILM_STEPS, card.seed, FILM_SIZE, card.imports)
+        record(folder, folder / VIDEO, FILM_STEPS, card.seed, FILM_SIZE, card.imports, left_in=run)
     elif is_there(filmed):
         if filmed.stat().st_mtime < max((best / name).stat().st_mtime for name in POLICY_BYTES):
             tell(f"{filmed} is older than the policy, and left out: --video films it anew")

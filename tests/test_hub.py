@@ -63,7 +63,8 @@ def test_no_connection_is_one_line(monkeypatch: pytest.MonkeyPatch, action: Call
 @pytest.mark.parametrize(
     "text",
     ["/home/ada/robot.xml", "~/robot.xml", "~ada/robot.xml", r"C:\robots\one.xml", "C:/robots", r"\\server\share",
-     "file:robot.xml", "file:///home/ada", "//server/share/x", "/-x/y", "replay:/home/ada/runs/a", "--model=/data/x", f"{Path.home()}"],
+     "file:robot.xml", "file:///home/ada", "//server/share/x", "/-x/y", "replay:/home/ada/runs/a",
+     "--model=/data/x", f"{Path.home()}"],
 )  # fmt: skip
 def test_paths_of_a_machine_are_seen_anywhere(text: str) -> None:
     for values in ({"arguments": {"deep": [1, text]}}, {"arguments": {text: 1}}):
@@ -90,7 +91,7 @@ def test_what_a_run_began_with_is_published_by_its_content() -> None:
     assert public_config(by_id, Prefilled(100, "ab" * 32)) == by_id
 
 
-def test_what_strangers_write_reaches_the_terminal_without_control_characters() -> None:
+def test_what_strangers_write_is_printed_without_control_characters() -> None:
     with pytest.raises(UserError) as told:
         require_own("user/name", {"\x1b[2Jevil\n"}, {"policy.json"})
     assert for_terminal(told.value, str(told.value)).isprintable()

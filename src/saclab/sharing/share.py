@@ -53,7 +53,7 @@ def share(
         folder: write there what would be sent, and send nothing.
         private: make the repository so that only its owner sees it.
         license: an identifier of the Hub's for the card, such as mit.
-        video: film an episode anew; else best/video.mp4 is taken if there is one.
+        video: film an episode anew; else video.mp4 in best is taken if there is one.
         onnx: add the policy as an ONNX file.
         episodes: fresh ones, of which the card tells the score.
         seed: of those episodes.
@@ -71,26 +71,34 @@ def share(
     require(episodes >= 1, "episodes", episodes, "use at least 1")
     require_name(repository)
     require_fresh(folder) if folder is not None else require_token()
-    found = read_run(run)
-    found = found._replace(config=public_config(found.config, found.prefill))
-    if not paths_too:
-        require_no_paths(found.config.to_dict() | msgspec.to_builtins(read_policy_description(run)))
+    found = public_record(run, paths_too)
     with TemporaryDirectory(prefix="saclab-share-") as name:
         copy = Path(name)
         copy_policy(run, copy)  # what is sent is what is evaluated, whatever a run that goes on finds meanwhile
         tell(f"evaluating the best policy on {episodes} fresh episodes …")
         score = evaluate(copy, episodes, seed, imports=imports, left_in=run)
-        card = Card(repository, found, score, seed, imports, license)
-        files = collect(run, copy, card, video, onnx, tell)
+        files = collect(run, copy, Card(repository, found, score, seed, imports, license), video, onnx, tell)
         if not paths_too:
             require_no_paths({name: path.read_text() for name, path in files.items() if path.suffix in TEXTS})
         tell("\n".join(f"  {path.name:<20} {path.stat().st_size:>12,} bytes" for path in files.values()))
-        if folder is not None:
-            return str(written(files, folder))
-        seen = "which only you will see" if private else "for everybody to see, unless the repository is private"
-        tell(f"sending these to {repository}, {seen} …")
-        message = f"{found.config.variant} on {found.config.environment}, trained and shared by saclab"
-        return upload(repository, files, POLICY_BYTES.keys(), {VIDEO, ONNX, *RESULTS}, private, message)
+        return str(written(files, folder)) if folder is not None else sent(repository, files, found, private, tell)
+
+
+def public_record(run: Path, paths_too: bool) -> RunRecord:
+    """A run with its configuration as it may be published; raises UserError for a path of this machine in it."""
+    found = read_run(run)
+    found = found._replace(config=public_config(found.config, found.prefill))
+    if not paths_too:
+        require_no_paths(found.config.to_dict() | msgspec.to_builtins(read_policy_description(run)))
+    return found
+
+
+def sent(repository: str, files: dict[str, Path], found: RunRecord, private: bool, tell: Tell) -> str:
+    """Upload the files; the address of the page."""
+    seen = "which only you will see" if private else "for everybody to see, unless the repository is private"
+    tell(f"sending these to {repository}, {seen} …")
+    message = f"{found.config.variant} on {found.config.environment}, trained and shared by saclab"
+    return upload(repository, files, POLICY_BYTES.keys(), {VIDEO, ONNX, *RESULTS}, private, message)
 
 
 def require_fresh(folder: Path) -> None:

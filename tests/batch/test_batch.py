@@ -241,7 +241,8 @@ train(Path(sys.argv[2]), mixed())
 """
 
 
-@pytest.mark.parametrize("devices", [4, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("devices", [4, 2])
 def test_runs_are_spread_over_devices(tmp_path, devices):
     """Three runs: on two devices one slot stays empty, on four as well."""
     flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}

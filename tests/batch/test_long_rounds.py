@@ -61,6 +61,7 @@ def pausing_after(updates: int, requests: Requests) -> Iterator[None]:
         yield
 
 
+@pytest.mark.slow
 def test_a_round_that_is_always_to_pause_still_goes_on():
     """As where checkpoints are due all the time: each call makes a part at least."""
     with closing(engine_of(mixed(**LONG))) as group:
@@ -73,7 +74,8 @@ def test_a_round_that_is_always_to_pause_still_goes_on():
             assert (group.steps, group.updates) > before
 
 
-@pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [0, 1])
 def test_a_stop_between_two_parts_goes_on_bit_for_bit(tmp_path, delay):
     """In the first round, and in a later one of which two parts are made."""
     configs = mixed(acting_delay=delay, **LONG)
@@ -128,6 +130,7 @@ def breaking(step):
     return lambda action: step(action) | {1: RunBroken("it broke")}
 
 
+@pytest.mark.slow
 def test_a_stop_within_the_q_bias_of_a_group_goes_on_bit_for_bit(tmp_path):
     """The estimate takes the workers longer than the stop."""
     configs = mixed(q_bias_episodes=2, **LONG)

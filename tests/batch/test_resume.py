@@ -47,6 +47,7 @@ def test_a_group_with_every_axis_at_once_goes_on_bit_for_bit(tmp_path):
         assert_same_run(tmp_path / "straight" / run, tmp_path / "stopped" / run)
 
 
+@pytest.mark.slow
 def test_a_group_that_goes_on_reads_each_file_of_its_checkpoints_once(tmp_path, monkeypatch):
     """A replay buffer may have gigabytes."""
     configs, reads, real = mixed(), [], checkpoint.read_arrays

@@ -125,6 +125,7 @@ def test_a_tracker_that_breaks_is_told_of_and_the_run_goes_on(tmp_path: Path, ml
     assert isinstance(told[-1], events.Finished)
 
 
+@pytest.mark.slow
 def test_resume_goes_on_with_the_trackers_that_are_named(
     tmp_path: Path, mlflow: Any, saclab_again: Callable[..., Told]
 ) -> None:

@@ -127,7 +127,7 @@ def test_the_critics_are_reduced_as_the_policy_reduces_them() -> None:
     assert by_mean[1] - by_mean[0] == pytest.approx(5.0, rel=1e-3)
 
 
-@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a group"])
+@pytest.mark.parametrize("together", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["alone", "in a group"])
 def test_the_logged_bias_takes_the_reduction_of_the_settings(tmp_path: Path, together: bool) -> None:
     """Two runs that differ in it and have made no update: they have the same critics, which do not agree."""
     mean_q = []

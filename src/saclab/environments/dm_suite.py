@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from saclab.environments.mujoco_state import integration_state
+
 # Targets, gains and terrain: all that tasks of the suite change but colours.
 MODEL_ARRAYS = (
     "body_pos", "body_quat", "dof_damping", "geom_pos", "geom_size", "hfield_data", "site_pos", "site_size", "wrap_prm",
@@ -33,15 +35,11 @@ def is_dm_suite(environment: Any) -> bool:
 
 def capture_dm_suite(environment: Any) -> dict[str, np.ndarray]:
     """All that decides how the episode goes on, and the next ones."""
-    import mujoco
-
     inner = environment._env
-    model, data, kind = inner.physics.model.ptr, inner.physics.data.ptr, mujoco.mjtState.mjSTATE_INTEGRATION
-    integration = np.empty(mujoco.mj_stateSize(model, kind))
-    mujoco.mj_getState(model, data, integration, kind)
+    model, data = inner.physics.model.ptr, inner.physics.data.ptr
     _, keys, *rest = inner.task._random.get_state()
     return {
-        "integration": integration,
+        "integration": integration_state(model, data),
         "episode": np.array([inner._step_count, inner._reset_next_step], np.int64),
         "generator_keys": np.array(keys),
         "generator_rest": np.array(rest, np.float64),

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from saclab.environments.mujoco_state import capture_simulation, restore_simulation
+
 # Derived quantities that a step leaves behind the state, and from which the next one places the mocap body.
 LAGGING = ("xpos", "xquat")
 
@@ -25,28 +27,11 @@ def is_fetch(environment: Any) -> bool:
 
 def capture_fetch(environment: Any) -> dict[str, np.ndarray]:
     """All that decides how the episode goes on, but for the generator."""
-    import mujoco
-
-    model, data, kind = environment.model, environment.data, mujoco.mjtState.mjSTATE_INTEGRATION
-    integration = np.empty(mujoco.mj_stateSize(model, kind))
-    mujoco.mj_getState(model, data, integration, kind)
-    return {"integration": integration, "goal": environment.goal.copy()} | {
-        name: getattr(data, name).copy() for name in LAGGING
-    }
+    simulation = capture_simulation(environment.model, environment.data, LAGGING)
+    return simulation | {"goal": environment.goal.copy()}
 
 
 def restore_fetch(environment: Any, state: dict[str, np.ndarray]) -> None:
-    """Go on from `capture_fetch` in an environment that has been reset once.
-
-    The state is set twice because mj_forward overwrites the warm start that came with it.
-    """
-    import mujoco
-
-    model, data, kind = environment.model, environment.data, mujoco.mjtState.mjSTATE_INTEGRATION
-    mujoco.mj_resetData(model, data)
-    mujoco.mj_setState(model, data, state["integration"], kind)
-    mujoco.mj_forward(model, data)
-    mujoco.mj_setState(model, data, state["integration"], kind)
-    for name in LAGGING:
-        getattr(data, name)[:] = state[name]
+    """Go on from `capture_fetch` in an environment that has been reset once."""
+    restore_simulation(environment.model, environment.data, state, LAGGING)
     environment.goal = state["goal"].copy()

@@ -31,6 +31,7 @@ from gymnasium.wrappers import (
 
 from saclab.environments.dm_suite import capture_dm_suite, is_dm_suite, restore_dm_suite
 from saclab.environments.fetch import capture_fetch, is_fetch, restore_fetch
+from saclab.environments.mujoco_state import capture_simulation, restore_simulation
 
 Environment: TypeAlias = gymnasium.Env[Any, Any]
 State: TypeAlias = dict[str, Any]
@@ -96,29 +97,11 @@ LAGGING = ("xpos", "xipos", "subtree_com")
 
 
 def capture_mujoco(environment: MujocoEnv) -> dict[str, np.ndarray]:
-    """The whole state of the simulator, the derived quantities that lag behind it included."""
-    import mujoco
-
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    integration = np.empty(mujoco.mj_stateSize(environment.model, kind))
-    mujoco.mj_getState(environment.model, environment.data, integration, kind)
-    return {"integration": integration} | {name: getattr(environment.data, name).copy() for name in LAGGING}
+    return capture_simulation(environment.model, environment.data, LAGGING)
 
 
 def restore_mujoco(environment: MujocoEnv, physics: dict[str, np.ndarray]) -> None:
-    """Positions and velocities are not enough: Hopper, Ant and Humanoid go on differently without the rest.
-
-    The state is set twice because mj_forward overwrites the warm start that came with it.
-    """
-    import mujoco
-
-    model, data, kind = environment.model, environment.data, mujoco.mjtState.mjSTATE_INTEGRATION
-    mujoco.mj_resetData(model, data)
-    mujoco.mj_setState(model, data, physics["integration"], kind)
-    mujoco.mj_forward(model, data)
-    mujoco.mj_setState(model, data, physics["integration"], kind)
-    for name in LAGGING:
-        getattr(data, name)[:] = physics[name]
+    restore_simulation(environment.model, environment.data, physics, LAGGING)
 
 
 def is_gymnasium_mujoco(environment: Environment) -> bool:

@@ -129,7 +129,7 @@ def test_a_run_at_its_score_is_worth_the_way_there(tmp_path):
     never = tune(tmp_path / "never", 1, objective="steps", score=0.0)
     assert never.own_value == 2 * 160, "PAR2 of a run of 160 steps"
     assert (never.best, never.commands) == (None, []), "what was never reached is no result"
-    assert "No trial has got to the score" in never.page.read_text()
+    assert "with all of its runs at the score yet" in never.page.read_text()
 
 
 def test_a_tune_without_the_variants_own_settings_goes_on_too(tmp_path):
@@ -182,6 +182,10 @@ def test_a_trial_slower_than_the_best_is_given_up_at_rest_too(tmp_path, at_rest)
     best = study.ask()
     best.set_user_attr(WAY, 1)
     study.tell(best, 30.0)
+    short = study.ask()
+    short.set_user_attr(WAY, 0)
+    study.tell(short, 5.0)  # PAR2 of a run that broke off early: no way to the score
+    assert best_trial(study, plan).number == best.number
     assert not trial_with(study, [[-1.0, -1.0, 1.0]], at_rest).hopeless(plan, study), "at its score after 30 steps"
     assert not trial_with(study, [[-1.0, -1.0, -1.0, 1.0]], at_rest).hopeless(plan, study)
     slower = trial_with(study, [[-1.0] * 4 + [1.0]], at_rest)
@@ -359,5 +363,5 @@ def make_plan_of(folder: Path):
 
 def test_the_best_of_no_trials_is_none(tmp_path):
     study = open_study(tmp_path, plan_of())
-    assert best_trial(study) is None
+    assert best_trial(study, plan_of()) is None
     assert not any(map(is_complete, study.trials))

@@ -10,7 +10,7 @@ from saclab.grid.tasks import RunStatus
 from saclab.training.run_folder import read_evaluations
 from saclab.tuning.objective import Evaluations, Objective
 from saclab.tuning.plan import TunePlan
-from saclab.tuning.study import best_trial, reached_score
+from saclab.tuning.study import best_trial
 
 if TYPE_CHECKING:
     import optuna
@@ -89,21 +89,17 @@ class OpenTrial:
 
         Every evaluation is judged by itself, so that the answer is the same however many have come since the last look.
         """
-        objective, best = plan.objective, best_trial(study)
-        if not objective.kind.to_score:
-            return self._too_low(objective, study)
-        return self._too_slow(objective, best.value) if best is not None and reached_score(best, plan) else ""
+        if not plan.objective.kind.to_score:
+            return self._too_low(plan.objective, study)
+        best = best_trial(study, plan)
+        return "" if best is None else self._too_slow(plan.objective, best.value or 0.0)
 
-    def _too_slow(self, objective: Objective, best: float | None) -> str:
+    def _too_slow(self, objective: Objective, best: float) -> str:
         """Whether more has been spent on the way to the score than the best trial needed, which got there."""
         runs, ended = list(self.evaluations), [run.status == "finished" for run in self.runs]
-        if (
-            self.is_whole(objective) and runs[-1] is not None
-        ):  # as it was at the last evaluation that had something to wait for
+        if self.is_whole(objective) and runs[-1] is not None:  # as it was while there was something to wait for
             runs[-1], ended[-1] = objective.before_score(runs[-1]), False
-        if best is None or objective.at_least(runs, ended) <= best:
-            return ""
-        return f"it needs more than the best so far, {best:.4g}"
+        return f"it needs more than the best so far, {best:.4g}" if objective.at_least(runs, ended) > best else ""
 
     def _too_low(self, objective: Objective, study: optuna.Study) -> str:
         """Whether it is below the median of the others at an evaluation, once all its runs have made it."""

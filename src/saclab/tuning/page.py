@@ -21,7 +21,7 @@ from saclab.training.run_folder import run_path
 from saclab.tuning.figures import figures
 from saclab.tuning.plan import TunePlan, trial_name
 from saclab.tuning.space import value_text, values_of
-from saclab.tuning.study import WHY, best_trial, ended_trials, is_complete, reached_score, value_in_words
+from saclab.tuning.study import WHY, best_trial, ended_trials, is_complete, value_in_words
 
 if TYPE_CHECKING:
     import optuna
@@ -90,11 +90,10 @@ def lead(study: optuna.Study, plan: TunePlan) -> str:
 
 def best_html(study: optuna.Study, plan: TunePlan, folder: Path) -> str:
     """The best trial beside the variant's own values, and the commands that judge it."""
-    best = best_trial(study)
+    best = best_trial(study, plan)
     if best is None:
-        return "<p>No trial has come to its end yet.</p>"
-    if not reached_score(best, plan):
-        return f"<p>No trial has got to the score with all of its runs; trial {best.number} came nearest.</p>"
+        at_score = ", with all of its runs at the score" if plan.objective.kind.to_score else ""
+        return f"<p>No trial has come to its end{at_score} yet.</p>"
     settings = values_of(plan.space, best.params)
     rows = [(name, value_text(own), value_text(settings[name])) for name, own in plan.own_values.items()]
     own = own_trial(study, plan)
@@ -160,9 +159,7 @@ def trials_table(study: optuna.Study, plan: TunePlan) -> Table:
     rows = tuple(
         (
             str(trial.number),
-            value_in_words(trial, plan).replace(" ", "\N{NO-BREAK SPACE}")
-            if is_complete(trial)
-            else "given\N{NO-BREAK SPACE}up",
+            unbroken_words(value_in_words(trial, plan) if is_complete(trial) else "given up"),
             *(value_text(values_of(plan.space, trial.params).get(name, "")) for name in plan.space),
             unbroken_words(shown(trial.user_attrs.get(WHY, ""), 120)),
         )

@@ -113,11 +113,11 @@ def ended_trials(study: optuna.Study) -> list[FrozenTrial]:
     return [trial for trial in study.trials if trial.state.is_finished()]
 
 
-def best_trial(study: optuna.Study) -> FrozenTrial | None:
-    """The trial with the best value; None if there is none with a value."""
-    with suppress(ValueError):
-        return study.best_trial
-    return None
+def best_trial(study: optuna.Study, plan: TunePlan) -> FrozenTrial | None:
+    """The trial with the best value among those that were measured: with all runs at the score, where there is one."""
+    measured = [trial for trial in study.trials if is_complete(trial) and reached_score(trial, plan)]
+    best = min if plan.objective.kind.to_score else max
+    return best(measured, key=lambda trial: trial.value or 0.0, default=None)
 
 
 def is_complete(trial: FrozenTrial) -> bool:

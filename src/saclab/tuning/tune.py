@@ -17,7 +17,7 @@ from saclab.tuning.objective import ObjectiveName
 from saclab.tuning.page import judging_commands, own_trial, write_page
 from saclab.tuning.plan import TunePlan, is_recorded, make_plan
 from saclab.tuning.space import read_space, values_of
-from saclab.tuning.study import best_trial, reached_score
+from saclab.tuning.study import best_trial
 from saclab.tuning.tuner import Tune, search
 
 Show = Callable[[Iterable[Tune]], Tune]
@@ -110,8 +110,7 @@ def tuned(
     resources.require_startable(plan.extremes(folder))
     with requests_from_signals() as requests:
         state = show(search(plan, folder, trials, resources.pool(checkpoint_minutes), requests, resources.batch))
-    best, own = best_trial(state.study), own_trial(state.study, plan)
-    best = best if best is not None and reached_score(best, plan) else None
+    best, own = best_trial(state.study, plan), own_trial(state.study, plan)
     settings = None if best is None else values_of(plan.space, best.params)
     better = best is not None and (own is None or own.number != best.number)
     return Tuned(

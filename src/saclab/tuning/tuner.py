@@ -18,7 +18,7 @@ from saclab.training.lock import locked
 from saclab.training.requests import Requests
 from saclab.tuning.open_trial import OpenTrial
 from saclab.tuning.plan import PLAN, TunePlan, is_recorded, trial_name
-from saclab.tuning.study import WAY, WHY, best_trial, drawn_settings, ended_trials, open_study, trials_under_way
+from saclab.tuning.study import WAY, WHY, drawn_settings, ended_trials, is_complete, open_study, trials_under_way
 
 if TYPE_CHECKING:
     import optuna
@@ -137,7 +137,7 @@ class Tune:
             trial.set_user_attr(WHY, why)
         self.study.tell(trial.number, value, None if value is not None else pruned())
         self.ended = ended_trials(self.study)
-        if len(self.ended) >= FAILURES and best_trial(self.study) is None:
+        if len(self.ended) >= FAILURES and not any(map(is_complete, self.ended)):
             raise TrainingFailed(
                 f"none of the first {len(self.ended)} trials came to its end; the last one: {why}: change what is "
                 "searched or what holds for every trial, in another folder (--out)"

@@ -9,7 +9,7 @@ WHEEL := .venv-wheel
 
 LINTED := src tests benchmarks examples docs/site_hooks.py
 
-.PHONY: quickstart test test-slow peers suites wheel docs fuzz check lint format types benchmark clean
+.PHONY: quickstart test test-slow peers suites wheel docs fuzz check lint format types benchmark benchmark-details clean
 
 quickstart: $(VENV)/installed  ## compare four variants on HalfCheetah-v4, in minutes
 	$(BIN)/saclab compare HalfCheetah-v4 --protocol quick
@@ -51,10 +51,12 @@ format: $(VENV)/installed
 types: $(VENV)/installed
 	$(BIN)/mypy
 
-benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other libraries: leave the machine alone for half an hour
+benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other libraries: leave the machine alone meanwhile
 	$(BIN)/python benchmarks/speed.py --peers $(PEERS)/bin/python
 	$(BIN)/python benchmarks/tables.py speed
 	$(BIN)/python benchmarks/tables.py peers
+
+benchmark-details: $(VENV)/installed  ## where the time and the memory go: leave the machine alone meanwhile
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/memory.py

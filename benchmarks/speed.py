@@ -1,6 +1,6 @@
 """A race: saclab and its peers train the same job on this machine, in turn, and a table of the ratios.
 
-    python benchmarks/speed.py --peers .venv-peers/bin/python [--rounds 5] [--only TEXT]
+    python benchmarks/speed.py --peers .venv-peers/bin/python [--rounds 3] [--only TEXT]
 
 End to end: environment, replay, acting, updates, logging, evaluations and the best policy's file; each library by its
 own loop, evaluations side by side in all of them. Plain SAC with Table 1 of the paper. Every round runs all contestants
@@ -8,9 +8,10 @@ of a case one after the other, so a ratio compares neighbours in time; medians o
 compilation and the first updates are outside the rate and shown as the seconds from the start of the process to the
 first update.
 
-A case is a single run that may use all cores, or as many runs at once as there are cores, one core each: their rates
-are added. What each is compared with in the end is the machine: the time that the update's matrix products and the raw
-simulator need (machine_limit.py, measured in the same round), the steps of saclab's evaluations counted in.
+A case is a single run that may use all cores, a single run on one core, or a grid: as many runs at once as there are
+cores, one core each, whose rates are added. What each is compared with in the end is the machine: the time that the
+update's matrix products and the raw simulator need (machine_limit.py, measured in the same round), the steps of
+saclab's evaluations counted in.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,33 +34,6 @@ from keep import facts  # noqa: E402
 from stopwatch import Job  # noqa: E402
 
 from saclab.machine import thread_limits, usable_cores  # noqa: E402
-
-
-@dataclass(frozen=True)
-class Case:
-    environment: str
-    update_interval: int
-    grid: bool
-    """One process per core, or one process alone."""
-    timed_updates: int
-    evaluation_interval_steps: int
-    evaluation_episodes: int
-    warm_updates: int = 100
-
-    @property
-    def name(self) -> str:
-        ratio = "1:1" if self.update_interval == 1 else f"1:{self.update_interval}"
-        return f"{self.environment}, {ratio}, {'grid' if self.grid else 'single run'}"
-
-
-# Two evaluation steps per training step, as under `paper` with episodes of 1000 steps; windows of whole evaluations.
-CASES = [
-    Case(environment, interval, grid, timed_updates, evaluation_interval, episodes)
-    for interval, grid, timed_updates, evaluation_interval, episodes in (
-        (5, False, 400, 2000, 4), (1, False, 500, 500, 1), (5, True, 400, 2000, 4),
-    )
-    for environment in ("HalfCheetah-v4", "Humanoid-v4")
-]  # fmt: skip
 
 SACLAB = {
     "saclab": (),
@@ -74,10 +49,57 @@ PEERS = {
 }
 
 
+@dataclass(frozen=True)
+class Place:
+    """Which cores a case may use, and who races there."""
+
+    cores: Callable[[list[int]], list[list[int]]]
+    """The machine's cores -> those of each process."""
+    contestants: tuple[str, ...]
+
+
+PLACES = {
+    "single run": Place(lambda cores: [cores], (*SACLAB, *PEERS)),
+    "one core": Place(lambda cores: [cores[:1]], ("saclab", "Stable-Baselines3", "SBX", "RLtools")),
+    "grid": Place(lambda cores: [[core] for core in cores], ("saclab", "saclab, averaged", *PEERS)),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    environment: str
+    update_interval: int
+    place: str
+    """A key of PLACES."""
+    timed_updates: int
+    evaluation_interval_steps: int
+    evaluation_episodes: int
+    warm_updates: int = 100
+
+    @property
+    def name(self) -> str:
+        return f"{self.environment}, 1:{self.update_interval}, {self.place}"
+
+    def processes(self) -> list[list[int]]:
+        """The cores of each process."""
+        return PLACES[self.place].cores(usable_cores())
+
+
+# Two evaluation steps per training step, as under `paper` with episodes of 1000 steps; windows of whole evaluations.
+CASES = [
+    Case(environment, interval, place, timed_updates, evaluation_interval, episodes)
+    for interval, place, timed_updates, evaluation_interval, episodes in (
+        (5, "single run", 400, 2000, 4), (5, "one core", 400, 2000, 4), (1, "one core", 500, 500, 1),
+        (5, "grid", 400, 2000, 4),
+    )
+    for environment in ("HalfCheetah-v4", "Humanoid-v4")
+]  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--peers", type=Path, required=True, help="Python of the environment that holds the peers")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--results", type=Path, default=HERE / "results" / "speed.json")
     options = parser.parse_args()
@@ -96,11 +118,12 @@ def race(case: Case, peers: Path) -> dict[str, dict[str, Any]]:
     """One round: contestant -> its result; the entry `limit` is the machine's."""
     processes = in_processes(case, lambda _: [sys.executable, str(HERE / "machine_limit.py"), case.environment])
     results = {}
-    for name, settings in SACLAB.items():
-        if name == "saclab" or case.update_interval > 1:
-            results[name] = run(case, [sys.executable, str(HERE / "contestants" / "saclab_run.py")], settings)
-    for name, (script, package) in PEERS.items():
-        results[name] = run(case, [str(peers), str(HERE / "contestants" / script)], package=package)
+    for name in PLACES[case.place].contestants:
+        if name in SACLAB:
+            results[name] = run(case, [sys.executable, str(HERE / "contestants" / "saclab_run.py")], SACLAB[name])
+        else:
+            script, package = PEERS[name]
+            results[name] = run(case, [str(peers), str(HERE / "contestants" / script)], package=package)
     return {"limit": limit(case, processes, results["saclab"]["test_steps_per_step"]), **results}
 
 
@@ -143,16 +166,15 @@ def run(
 
 
 def in_processes(case: Case, command: Any) -> list[dict[str, Any]]:
-    """What the command prints as its last line, from one process, or from one on each core at the same time."""
-    cores = usable_cores()
-    places = [[core] for core in cores] if case.grid else [cores]
+    """What the command prints as its last line, from each process of the case, all at the same time."""
+    places = case.processes()
     processes = [
         subprocess.Popen(
             command(number), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            env=os.environ | (thread_limits(1) if case.grid else {}),
-            preexec_fn=lambda place=place: os.sched_setaffinity(0, place),
+            env=os.environ | (thread_limits(1) if len(cores) == 1 else {}),
+            preexec_fn=lambda cores=cores: os.sched_setaffinity(0, cores),
         )
-        for number, place in enumerate(places)
+        for number, cores in enumerate(places)
     ]  # fmt: skip
     reports = []
     for process in processes:

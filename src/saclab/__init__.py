@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from saclab.api import Comparison, compare, events, resume, train
     from saclab.errors import TrainingFailed, UserError
+    from saclab.trackers.asked import Tracking
     from saclab.trained_policy import TrainedPolicy, load_policy
     from saclab.training.events import (
         EpisodeEnded,
@@ -25,13 +26,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Comparison", "EpisodeEnded", "Evaluated", "Finished", "Interrupted", "Progress", "Requests", "RunRecord", "Saved",
-    "Started", "TrainedPolicy", "TrainingFailed", "Tuned", "UpdatesLogged", "UserError", "Warned", "compare", "events",
-    "load_policy", "read_run", "resume", "train", "tune",
+    "Started", "Tracking", "TrainedPolicy", "TrainingFailed", "Tuned", "UpdatesLogged", "UserError", "Warned",
+    "compare", "events", "load_policy", "read_run", "resume", "train", "tune",
 ]  # fmt: skip
 
 _HOMES = {
     "saclab.api": ("Comparison", "compare", "events", "resume", "train"),
     "saclab.errors": ("TrainingFailed", "UserError"),
+    "saclab.trackers.asked": ("Tracking",),
     "saclab.trained_policy": ("TrainedPolicy", "load_policy"),
     "saclab.training.events": (
         "EpisodeEnded", "Evaluated", "Finished", "Interrupted", "Progress", "Saved", "Started", "UpdatesLogged",

@@ -17,6 +17,7 @@ from saclab.limits import require_minutes
 from saclab.protocols import make_config
 from saclab.report.runs import read_runs
 from saclab.signals import requests_from_signals
+from saclab.trackers.asked import NOWHERE, Tracking
 from saclab.training.events import Event
 from saclab.training.lock import alone_in
 from saclab.training.requests import Requests
@@ -162,9 +163,7 @@ def compare(
     seeds: int | Sequence[int] | None = None,
     protocol: str = "standard",
     *,
-    workers: int | None = None,
-    threads: int | None = None,
-    batch: int | None = None,
+    workers: int | None = None, threads: int | None = None, batch: int | None = None,
     runs: Path | str = "runs",
     name: str | None = None,
     sweep: Mapping[str, Sequence[Any]] | None = None,
@@ -177,8 +176,9 @@ def compare(
     ray_address: str | None = None,
     ray_cpus: float | None = None,
     ray_gpus: float = 0.0,
+    tracking: Tracking = NOWHERE,
     **overrides: Any,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Train every variant on every environment with every seed, in worker processes, then write the report.
 
     Args:
@@ -202,6 +202,7 @@ def compare(
         ray_address: where the cluster answers; None for RAY_ADDRESS, else the one on this machine, else a new one.
         ray_cpus: cores that Ray sets aside for each run; None for `threads`.
         ray_gpus: GPUs, or the part of one, that Ray sets aside for each run; 0 trains on cores.
+        tracking: the trackers that the runs' numbers are sent to.
         **overrides: any setting of AlgorithmSettings or TrainingSettings, for every run.
 
     Raises:
@@ -210,7 +211,7 @@ def compare(
     resources = chosen_resources(workers, threads, batch, launcher, ray_address, ray_cpus, ray_gpus)
     cells = make_grid(environments, variants, protocol, seeds, runs, environment_arguments, overrides, name, sweep)
     resources.require_startable(cells)
-    return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes)
+    return _compare(cells, resources, report or Path(runs) / "report", show, tell, checkpoint_minutes, tracking)
 
 
 def _compare(
@@ -220,13 +221,16 @@ def _compare(
     show: Show | None,
     tell: Callable[[str], None],
     checkpoint_minutes: float,
+    tracking: Tracking = NOWHERE,
 ) -> Comparison:
     require_minutes(checkpoint_minutes)
+    for cell in [cell for cell in cells if not cell.finished][:1]:
+        tracking.trackers(*cell)  # before anything is started; and MLflow's experiment is made by one process
     report = absolute(report)
     if note := resources.note(cells):
         tell(note)
     with requests_from_signals() as requests:
-        stream = launch(cells, resources.pool(checkpoint_minutes), requests, resources.batch)
+        stream = launch(cells, resources.pool(checkpoint_minutes, tracking), requests, resources.batch)
         statuses = (show or last)(reporting(stream, report, tell))
     return compared(statuses, report, requests.stop)
 

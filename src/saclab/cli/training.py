@@ -18,12 +18,12 @@ from saclab.config import Config
 from saclab.errors import SettingError
 from saclab.limits import require_threads
 from saclab.protocols import make_config
+from saclab.trackers.asked import Tracking
 from saclab.variants import COMPARED
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from saclab.cli.trackers import Tracker
     from saclab.training.events import Event
 
 Given = Mapping[str, Any]
@@ -38,35 +38,6 @@ class Where:
     """Wall-clock time between checkpoints; it does not change any result."""
     environment_arguments: str = "{}"
     """Keyword arguments of the environment, as JSON: '{"reset_noise_scale": 0.0}'."""
-
-
-@dataclass(frozen=True)
-class Tracking:
-    tensorboard: bool = False
-    """Write TensorBoard event files into the run folder; needs the extra `tensorboard`."""
-    wandb: str | None = None
-    """Send the run to this project of Weights & Biases; needs the extra `wandb`."""
-    mlflow: str | None = None
-    """Send the run to this experiment of MLflow, at MLFLOW_TRACKING_URI, or else in ./mlflow.db; needs the extra
-    `mlflow`."""
-
-    @property
-    def any(self) -> bool:
-        """Whether one is asked for."""
-        return self.tensorboard or self.wandb is not None or self.mlflow is not None
-
-    def trackers(self, config: Config, folder: Path) -> list[Tracker]:
-        """Those that were asked for, of a run; raises UserError if an extra is not installed."""
-        from saclab.cli import trackers
-
-        chosen: list[Tracker] = []
-        if self.tensorboard:
-            chosen.append(trackers.TensorBoard())
-        if self.wandb is not None:
-            chosen.append(trackers.WeightsAndBiases(self.wandb, config, folder))
-        if self.mlflow is not None:
-            chosen.append(trackers.MLflow(self.mlflow, config))
-        return chosen
 
 
 @dataclass(frozen=True)
@@ -174,6 +145,7 @@ class Compare:
     """GPUs, or the part of one, that Ray sets aside for each run, or for a run group; 0 trains on cores."""
     report: Path | None = None
     """Folder of the report; None for report in the runs' folder."""
+    tracking: OmitArgPrefixes[Tracking] = field(default_factory=Tracking)
     where: OmitArgPrefixes[Where] = field(default_factory=Where)
 
     def __call__(self, console: Console) -> int:
@@ -192,7 +164,7 @@ class Compare:
             environment_arguments=parse_arguments(self.where.environment_arguments),
             show=lambda stream: display.show_grid(stream, console),
             checkpoint_minutes=self.where.checkpoint_minutes, launcher=self.launcher, ray_address=self.ray_address,
-            ray_cpus=self.ray_cpus, ray_gpus=self.ray_gpus, **self.algorithm, **self.training,
+            ray_cpus=self.ray_cpus, ray_gpus=self.ray_gpus, tracking=self.tracking, **self.algorithm, **self.training,
         )  # fmt: skip
         return display.show_comparison(result, console)
 
@@ -258,8 +230,8 @@ def train_and_show(
 ) -> int:
     """Train in this process with a progress bar."""
     from saclab.cli import display
-    from saclab.cli.trackers import track
     from saclab.signals import EXIT_STATUS, requests_from_signals
+    from saclab.trackers.feed import track
     from saclab.training.loop import train
     from saclab.training.run_folder import is_finished
 
@@ -269,8 +241,8 @@ def train_and_show(
         console.print(f"{folder} is finished already; its results are kept{untold}", soft_wrap=True, markup=False)
     with requests_from_signals(process_ends=True) as requests:
         stream: Iterable[Event] = train(config, folder, requests, checkpoint_minutes)
-        for tracker in [] if finished else tracking.trackers(config, folder):
-            stream = track(stream, tracker)
+        if tracking.any and not finished:
+            stream = track(stream, tracking.trackers(config, folder))
         for _ in display.show_run(stream, console):
             pass
         if requests.stop:

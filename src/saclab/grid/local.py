@@ -12,10 +12,13 @@ from saclab.grid.pool import POLL_SECONDS, End, Report, WorkerPool
 from saclab.grid.tasks import Task
 from saclab.grid.worker_process import WorkerProcess
 from saclab.machine import thread_limits, usable_cores
+from saclab.trackers.asked import NOWHERE, Tracking
 
 
 @contextmanager
-def local_pool(workers: int, threads: int, checkpoint_minutes: float = 10, batch: int = 0) -> Iterator[WorkerPool]:
+def local_pool(
+    workers: int, threads: int, checkpoint_minutes: float = 10, batch: int = 0, tracking: Tracking = NOWHERE
+) -> Iterator[WorkerPool]:
     """A pool of local processes.
 
     Args:
@@ -23,9 +26,10 @@ def local_pool(workers: int, threads: int, checkpoint_minutes: float = 10, batch
         threads: cores that XLA uses in each worker.
         checkpoint_minutes: wall-clock time between checkpoints.
         batch: how many runs make a run group; 0 if each is trained alone.
+        tracking: where the runs' numbers are sent.
     """
     with selectors.DefaultSelector() as selector:
-        pool = LocalPool(selector, 1 if batch else workers, workers, threads, checkpoint_minutes)
+        pool = LocalPool(selector, 1 if batch else workers, workers, threads, checkpoint_minutes, tracking)
         try:
             yield pool
         finally:
@@ -47,17 +51,24 @@ class LocalPool:
     note = None
 
     def __init__(
-        self, selector: selectors.BaseSelector, places: int, environment_workers: int, threads: int, minutes: float
+        self,
+        selector: selectors.BaseSelector,
+        places: int,
+        environment_workers: int,
+        threads: int,
+        minutes: float,
+        tracking: Tracking,
     ) -> None:
         self.selector, self.places = selector, places
-        self.environment_workers, self.threads, self.checkpoint_minutes = environment_workers, threads, minutes
+        self.environment_workers, self.threads = environment_workers, threads
+        self.checkpoint_minutes, self.tracking = minutes, tracking
         self.free_cores = core_groups(places, threads)
         self.workers: dict[int, Worker] = {}
         """File descriptor of what a worker says -> the worker."""
 
     def start(self, task: Task) -> bool:
         cores = self.free_cores.pop(0) if self.free_cores else []  # none is left by those that hang
-        told = task.to_dict(self.checkpoint_minutes, cores, self.environment_workers)
+        told = task.to_dict(self.checkpoint_minutes, self.tracking, cores, self.environment_workers)
         process = WorkerProcess(told, thread_limits(self.threads))
         self.workers[process.output.fileno()] = Worker(task, process, cores)
         self.selector.register(process.output, selectors.EVENT_READ)

@@ -20,15 +20,20 @@ from saclab.grid.pool import POLL_SECONDS, End, Report, WorkerPool
 from saclab.grid.tasks import Task
 from saclab.grid.worker_process import WorkerProcess
 from saclab.machine import thread_limits
+from saclab.trackers.asked import NOWHERE, VARIABLES, Tracking
 
 PATIENCE = 90  # seconds; a machine that the cluster has lost needs a minute to notice and to end its workers
 GPU_MEMORY = 0.75  # of a GPU, which JAX takes at its start; those that share one take it of their share
-TOLD = ("JAX_", "XLA_")  # variables with which the user tells JAX and XLA what to do
+TOLD = ("JAX_", "XLA_", *VARIABLES)  # variables with which the user tells JAX, XLA and trackers what to do
 
 
 @contextmanager
 def ray_pool(
-    cluster: Cluster, threads: int, checkpoint_minutes: float = 10, workers: int | None = None
+    cluster: Cluster,
+    threads: int,
+    checkpoint_minutes: float = 10,
+    workers: int | None = None,
+    tracking: Tracking = NOWHERE,
 ) -> Iterator[WorkerPool]:
     """A pool of workers on a cluster.
 
@@ -37,6 +42,7 @@ def ray_pool(
         threads: cores that XLA uses in each worker.
         checkpoint_minutes: wall-clock time between checkpoints.
         workers: tasks on the cluster at a time; None leaves it to the cluster's room.
+        tracking: where the runs' numbers are sent.
 
     Raises:
         UserError: if Ray is not installed, the cluster does not answer, or one started here has too little for a task.
@@ -44,7 +50,7 @@ def ray_pool(
     with connected(cluster) as ray:
         lack = lacking_room(ray, cluster)
         note = f"{lack}: it waits for one" if lack else None
-        pool = RayPool(ray, cluster, threads, checkpoint_minutes, workers, note)
+        pool = RayPool(ray, cluster, threads, checkpoint_minutes, workers, note, tracking)
         try:
             yield pool
         finally:
@@ -70,6 +76,7 @@ class RayPool:
     checkpoint_minutes: float
     places: int | None
     note: str | None
+    tracking: Tracking
     replaces_lost: bool = True
     workers: dict[Any, Worker] = field(default_factory=dict)
     """Answer that is awaited -> the worker that gives it."""
@@ -84,7 +91,7 @@ class RayPool:
     def start(self, task: Task) -> bool:
         variables = worker_variables(self.threads, self.cluster.gpus)
         for_environments = max(1, int(self.cluster.cpus))
-        told = task.to_dict(self.checkpoint_minutes, workers=for_environments, patience=PATIENCE)
+        told = task.to_dict(self.checkpoint_minutes, self.tracking, workers=for_environments, patience=PATIENCE)
         self._ask(Worker(task, self.actor_type.remote(told, variables, str(Path.cwd()), dies_with_launcher=True)))
         return False
 
@@ -131,8 +138,8 @@ class RayPool:
 def worker_variables(threads: int, gpus: float) -> dict[str, str]:
     """Environment variables of a worker on any machine; where Ray has set one of them, this one counts.
 
-    What the user has told JAX and XLA here holds there. A task that has reserved no GPU sees none; for the others
-    Ray has named theirs in CUDA_VISIBLE_DEVICES.
+    What the user has told JAX, XLA and trackers here holds there. A task that has reserved no GPU sees none; for the
+    others Ray has named theirs in CUDA_VISIBLE_DEVICES.
     """
     share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{GPU_MEMORY * gpus:.3f}"} if gpus < 1 else {}
     told = {name: value for name, value in os.environ.items() if name.startswith(TOLD)}

@@ -16,6 +16,7 @@ from saclab.grid.pool import WorkerPool
 from saclab.grid.ray import ray_pool
 from saclab.limits import require_threads
 from saclab.machine import accelerator, usable_cores
+from saclab.trackers.asked import NOWHERE, Tracking
 
 BATCH_ON_ACCELERATOR = 16
 """Runs that are trained together, unless another number is asked for."""
@@ -33,12 +34,12 @@ class Resources(NamedTuple):
     cluster: Cluster | None
     """None for local workers."""
 
-    def pool(self, checkpoint_minutes: float) -> AbstractContextManager[WorkerPool]:
+    def pool(self, checkpoint_minutes: float, tracking: Tracking = NOWHERE) -> AbstractContextManager[WorkerPool]:
         """The workers of `saclab.grid.launch.launch`."""
         if self.cluster is not None:
-            return ray_pool(self.cluster, self.threads, checkpoint_minutes, self.workers)
+            return ray_pool(self.cluster, self.threads, checkpoint_minutes, self.workers, tracking)
         assert self.workers is not None
-        return local_pool(self.workers, self.threads, checkpoint_minutes, self.batch)
+        return local_pool(self.workers, self.threads, checkpoint_minutes, self.batch, tracking)
 
     def require_startable(self, cells: Sequence[Cell]) -> None:
         """Raise UserError before anything is started if an environment, a folder or the memory will not do."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from saclab.grid.groups import run_groups
 from saclab.grid.plan import Cell
 from saclab.grid.rate import RateMeter
 from saclab.signals import EXIT_STATUS, how_it_ended
+from saclab.trackers.asked import NOWHERE, Tracking
 from saclab.training.lock import holder
 
 Status = Literal["waiting", "running", "finished", "interrupted", "failed"]
@@ -103,12 +104,18 @@ class Task:
                 run.status = "running"
 
     def to_dict(
-        self, checkpoint_minutes: float, cores: Sequence[int] = (), workers: int = 1, patience: float = 0
+        self,
+        checkpoint_minutes: float,
+        tracking: Tracking = NOWHERE,
+        cores: Sequence[int] = (),
+        workers: int = 1,
+        patience: float = 0,
     ) -> dict[str, Any]:
         """What `saclab.grid.worker` takes on its standard input.
 
         Args:
             checkpoint_minutes: wall-clock time between checkpoints.
+            tracking: where the runs' numbers are sent.
             cores: it keeps to these; none leaves them to the system.
             workers: of a run group, the processes that step environments.
             patience: seconds that it waits for a run folder that is in use.
@@ -119,6 +126,7 @@ class Task:
             "slots": self.slots,
             "workers": workers,
             "checkpoint_minutes": checkpoint_minutes,
+            "tracking": asdict(tracking),
             "cores": list(cores),
             "patience": patience,
         }

@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from saclab.environments.watch import log
 from saclab.errors import RunBroken
 from saclab.exits import end_after
 from saclab.signals import die_with
+from saclab.trackers.asked import Tracking, trackers_of
 from saclab.training.lock import InUse, wait_until_free
 
 if TYPE_CHECKING:
@@ -88,19 +89,29 @@ class Teller(logging.Handler):
 
 
 def events(task: dict[str, Any], requests: Requests) -> Iterator[tuple[int, Event]]:
-    """The events of the task's runs, each with the place of its run."""
-    configs = [Config.from_dict(run["config"]) for run in task["runs"]]
-    folders = [Path(run["folder"]) for run in task["runs"]]
+    """The events of the task's runs, each with the place of its run; trackers get their numbers."""
+    from saclab.trackers.feed import track_runs
+
+    runs = [(Config.from_dict(run["config"]), Path(run["folder"])) for run in task["runs"]]
+    trackers = trackers_of(Tracking(**task["tracking"]), runs)
+    return track_runs(trained(task, runs, requests), trackers)
+
+
+def trained(
+    task: dict[str, Any], runs: Sequence[tuple[Config, Path]], requests: Requests
+) -> Iterator[tuple[int, Event]]:
+    """The events of runs while they are trained."""
     if task["slots"]:
         from saclab.batch.loop import train_batch
 
+        configs, folders = [config for config, _ in runs], [folder for _, folder in runs]
         yield from train_batch(
             configs, folders, requests, task["checkpoint_minutes"], task["slots"], task["workers"]
         )  # fmt: skip
     else:
         from saclab.training.loop import train
 
-        for event in train(configs[0], folders[0], requests, task["checkpoint_minutes"]):
+        for event in train(*runs[0], requests, task["checkpoint_minutes"]):
             yield 0, event
 
 

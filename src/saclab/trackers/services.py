@@ -1,90 +1,19 @@
-"""Experiment trackers: they read a run's events and nothing else. Each is an optional extra."""
+"""TensorBoard, Weights & Biases, MLflow: a small class each."""
 
 from __future__ import annotations
 
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from saclab.config import Config, flatten
-from saclab.errors import TrainingFailed, UserError, in_words
+from saclab.errors import UserError, in_words
 from saclab.extras import required
 from saclab.files import replace_file
 from saclab.training import events
-
-
-class Tracker(Protocol):
-    """What takes a run's numbers."""
-
-    def open(self, started: events.Started) -> None:
-        """Begin with a run, or go on with a resumed one."""
-
-    def log(self, values: Mapping[str, float], step: int) -> None:
-        """Take numbers by name, of an environment step."""
-
-    def close(self, finished: bool) -> None:
-        """Nothing comes any more: the run is at its end, or was stopped and may go on."""
-
-
-def scalars(event: events.Event) -> tuple[dict[str, float], int] | None:
-    """The numbers of an event worth a curve, and the environment step; None if it has none."""
-    match event:
-        case events.UpdatesLogged():
-            return {f"losses/{name}": value for name, value in event.means.items()}, event.steps
-        case events.EpisodeEnded():
-            values = {"return": event.total_reward, "running_average": event.running_average, "length": event.length}
-            return {f"training/{name}": float(value) for name, value in values.items()}, event.steps
-        case events.Evaluated():
-            returns = event.total_rewards
-            values = {"mean_return": returns.mean(), "minimum": returns.min(), "maximum": returns.max()}
-            return {f"evaluation/{name}": float(value) for name, value in values.items()}, event.steps
-    return None
-
-
-def track(stream: Iterable[events.Event], tracker: Tracker) -> Iterator[events.Event]:
-    """Pass a run's events on, and send their numbers to a tracker.
-
-    A tracker that breaks is told of and gets nothing more: the run is worth more than its curves elsewhere.
-
-    Raises:
-        UserError: if it cannot be opened.
-        TrainingFailed: if it cannot be closed.
-    """
-    kind, tracking, finished = type(tracker).__name__, False, False
-    try:
-        for event in stream:
-            if isinstance(event, events.Started):
-                open_tracker(tracker, event)
-                tracking = True
-            elif tracking and (found := scalars(event)) is not None:
-                try:
-                    tracker.log(*found)
-                except Exception as error:
-                    tracking = False
-                    yield events.Warned(f"{kind} gets nothing more, and the run goes on: {in_words(error)}")
-            finished = finished or isinstance(event, events.Finished)
-            yield event
-    finally:
-        if tracking:
-            close_tracker(tracker, finished)
-
-
-def open_tracker(tracker: Tracker, started: events.Started) -> None:
-    try:
-        tracker.open(started)
-    except Exception as error:
-        raise UserError(f"{type(tracker).__name__} cannot be used: {in_words(error)}") from error
-
-
-def close_tracker(tracker: Tracker, finished: bool) -> None:
-    try:
-        tracker.close(finished)
-    except Exception as error:
-        said = f"{type(tracker).__name__} did not get the run's last numbers: {in_words(error)}"
-        raise TrainingFailed(f"{said}; what was saved is kept") from error
 
 
 def name_of(folder: Path) -> str:
@@ -111,7 +40,10 @@ class TensorBoard:
 
 
 class WeightsAndBiases:
-    """A run at Weights & Biases, under an id made of the run folder, so that a resumed run goes on there."""
+    """A run at Weights & Biases, under an id made of the run folder, so that a resumed run goes on there.
+
+    The seeds of an arm are a group there.
+    """
 
     def __init__(self, project: str, config: Config, folder: Path) -> None:
         """Raises UserError if the extra is not installed."""
@@ -122,8 +54,10 @@ class WeightsAndBiases:
         name = name_of(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self.run = self.module.init(
-            project=self.project, name=name, id=name, resume="allow", config=self.config.to_dict(), dir=str(self.folder)
-        )
+            project=self.project, name=name, id=name, group="-".join(self.folder.parts[-4:-1]), resume="allow",
+            config=self.config.to_dict(), dir=str(self.folder),
+            reinit="create_new",  # a run group has several at a time in one process
+        )  # fmt: skip
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         self.run.log(dict(values), step=step)

@@ -21,6 +21,7 @@ from saclab.environments.checked import CheckedEnvironment
 from saclab.errors import NonFiniteError
 from saclab.protocols import make_config
 from saclab.settings import AlgorithmSettings
+from saclab.training.events import Evaluated, Warned
 from saclab.training.logs import Q_BIAS_COLUMNS
 from saclab.training.loop import train
 from saclab.training.q_bias import Critics, Episode, QBias, known_returns, measure_q_bias
@@ -151,6 +152,17 @@ def test_no_known_return_gives_nan_and_no_pairs() -> None:
     bias = pendulum_bias(0.99, 0.0)  # 459 steps would have to follow, and Pendulum's episodes have 200
     assert bias.pairs == 0
     assert math.isnan(bias.mean_bias)
+
+
+def test_a_measurement_that_finds_nothing_is_warned_of_once(tmp_path: Path) -> None:
+    config = make_config("Pendulum-v1", "sac", "quick", overrides={
+        "hidden_layers": (8,), "batch_size": 16, "random_steps": 100, "max_steps": 600,
+        "evaluation_interval_steps": 200, "evaluation_episodes": 1, "q_bias_episodes": 1,
+    })  # fmt: skip
+    events = list(train(config, tmp_path))
+    (warned,) = [event.message for event in events if isinstance(event, Warned)]
+    assert "the last 459 steps have no known return at discount 0.99" in warned
+    assert sum(isinstance(event, Evaluated) for event in events) >= 3
 
 
 def test_columns_are_the_fields() -> None:

@@ -237,7 +237,8 @@ class Session:
                     yield self._fail(run, error, engine.snapshot(run))
                 case episodes, bias:
                     best = engine.runs[run].enter_evaluation(episodes, engine.actor(run))
-                    yield run, self.writers[run].log_evaluation(episodes, best, bias)
+                    for event in self.writers[run].log_evaluation(episodes, best, bias):
+                        yield run, event
 
     def _finish(self, reasons: dict[int, str]) -> Told:
         """Log, evaluate and save these runs for the last time; raises Stopped as `_evaluate` does."""

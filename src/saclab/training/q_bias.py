@@ -183,5 +183,18 @@ def known_returns(episode: Episode, alpha: float, discount: float) -> np.ndarray
         returns[step] = episode.reward[step] + discount * (returns[step + 1] + bonus[step + 1])
     if episode.terminated:
         return returns[:-1]
-    cut = math.ceil(math.log(NEGLIGIBLE) / math.log(discount)) if discount > 0 else 1
-    return returns[: max(0, len(episode.reward) - cut)]
+    return returns[: max(0, len(episode.reward) - steps_before_a_cut(discount))]
+
+
+def steps_before_a_cut(discount: float) -> int:
+    """How many steps before a time limit what would have followed it still counts."""
+    return math.ceil(math.log(NEGLIGIBLE) / math.log(discount)) if discount > 0 else 1
+
+
+def nothing_known(discount: float) -> str:
+    """What to say of a measurement without pairs."""
+    return (
+        "the Q bias has nothing to compare with: no episode reached a terminal state, and of one that a time limit "
+        f"cuts off the last {steps_before_a_cut(discount)} steps have no known return at discount {discount:g}: longer "
+        "episodes, a lower --discount or, to save the time, --q-bias-episodes 0"
+    )

@@ -19,7 +19,7 @@ from saclab.training.checkpoint import save_checkpoint
 from saclab.training.evaluation import EvaluationEpisodes
 from saclab.training.events import EpisodeEnded, Evaluated, Event, Finished, Progress, Saved, UpdatesLogged, Warned
 from saclab.training.logs import Logs
-from saclab.training.q_bias import QBias
+from saclab.training.q_bias import QBias, nothing_known
 from saclab.training.run_folder import append_line
 from saclab.training.snapshot import EnvironmentStates, Snapshot, to_checkpoint
 from saclab.training.starts import Beginning
@@ -44,7 +44,7 @@ class RunWriter:
         """
         self.run, self.notes = beginning.start.run, beginning.notes
         self.spec, self.folder, self.facts = spec, folder, facts
-        self.warned_of_temperature = self.policy_was_read = False
+        self.warned_of_temperature = self.warned_of_q_bias = self.policy_was_read = False
         self.resumed_at_step = self.run.counters.steps
         self._write_best()
         config = self.run.config
@@ -108,7 +108,7 @@ class RunWriter:
             "--temperature-learning-rate, or scale the environment's rewards"
         )
 
-    def log_evaluation(self, episodes: EvaluationEpisodes, best: bool, bias: QBias | None) -> Evaluated:
+    def log_evaluation(self, episodes: EvaluationEpisodes, best: bool, bias: QBias | None) -> Iterator[Event]:
         """Log an evaluation that the run has taken in, and beside it the terms of its return and the critics' bias."""
         counters = self.run.counters
         counted = counters.evaluations, counters.steps, counters.updates, counters.episodes
@@ -122,7 +122,10 @@ class RunWriter:
             self.logs.q_bias(*counted, *bias, self._seconds())
         if best:
             self._write_best()
-        return Evaluated(*counted, episodes.total_rewards, best)
+        yield Evaluated(*counted, episodes.total_rewards, best)
+        if bias is not None and bias.pairs == 0 and not self.warned_of_q_bias:
+            self.warned_of_q_bias = True
+            yield Warned(nothing_known(self.run.config.algorithm.discount))
 
     def _write_best(self) -> None:
         run = self.run

@@ -16,7 +16,8 @@ from environments import tiny  # noqa: F401 - registers them
 from saclab import memory
 from saclab.errors import NonFiniteError, SettingError, TrainingFailed
 from saclab.protocols import make_config
-from saclab.training import checkpoint, failure, loop, run_writer
+from saclab.settings import AlgorithmSettings
+from saclab.training import checkpoint, failure, loop, run_writer, symptoms
 from saclab.training.checkpoint import newest_first, read_manifest
 from saclab.training.common_checkpoint import load_newest_checkpoint
 from saclab.training.events import UpdatesLogged, Warned
@@ -108,17 +109,34 @@ def test_a_fixed_temperature_of_zero_has_a_logarithm_that_is_saved():
     [
         ((1e-5, 0.9), ["cannot reach the target entropy: lower --target-entropy"]),
         ((1.1, 100.0), ["raise --target-entropy"]),
-        (run_writer.SANE_TEMPERATURES, []),
+        (symptoms.SANE_TEMPERATURES, []),
     ],
     ids=["exploding", "collapsing", "sane"],
 )
 def test_a_runaway_temperature_is_told_once_with_advice(tmp_path, monkeypatch, sane, advice):
     """The temperature begins at 1 and stays near it for so few updates."""
-    monkeypatch.setattr(run_writer, "SANE_TEMPERATURES", sane)
+    monkeypatch.setattr(symptoms, "SANE_TEMPERATURES", sane)
     config = small_config("Pendulum-v1", max_steps=110, evaluation_interval_steps=1_000)
     told = [event.message for event in loop.train(config, tmp_path) if isinstance(event, Warned)]
     assert len(told) == len(advice)
     assert all(words in message for words, message in zip(advice, told, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("head", "bound", "scaling", "q_mean", "advice"),
+    [
+        ("categorical", 5.0, "none", -4.6, "cuts off what lies beyond 5: raise --critic-bound, or scale rewards"),
+        ("categorical", 5.0, "deviation", 4.6, "cuts off what lies beyond 5: raise --critic-bound"),
+        ("categorical", 5.0, "none", 4.4, ""),
+        ("scalar", 5.0, "none", 4.6, ""),
+    ],
+)
+def test_values_near_the_bound_of_a_categorical_critic_are_told(head, bound, scaling, q_mean, advice):
+    settings = AlgorithmSettings(critic_head=head, critic_bound=bound, reward_scaling=scaling)
+    told = symptoms.values_at_the_bound(settings, {"q_mean": q_mean})
+    assert advice in told
+    assert bool(told) == bool(advice)
+    assert ("scale rewards" in told) == (bool(advice) and scaling == "none")
 
 
 @pytest.mark.parametrize("temperature", [1e-9, 1.0, 1e9])

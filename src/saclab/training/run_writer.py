@@ -23,8 +23,7 @@ from saclab.training.q_bias import QBias, nothing_known
 from saclab.training.run_folder import append_line
 from saclab.training.snapshot import EnvironmentStates, Snapshot, to_checkpoint
 from saclab.training.starts import Beginning
-
-SANE_TEMPERATURES = (1e-5, 100.0)
+from saclab.training.symptoms import SYMPTOMS
 
 
 class RunWriter:
@@ -44,7 +43,8 @@ class RunWriter:
         """
         self.run, self.notes = beginning.start.run, beginning.notes
         self.spec, self.folder, self.facts = spec, folder, facts
-        self.warned_of_temperature = self.warned_of_q_bias = self.policy_was_read = False
+        self.warned_of = set[str]()
+        self.policy_was_read = False
         self.resumed_at_step = self.run.counters.steps
         self._write_best()
         config = self.run.config
@@ -90,23 +90,14 @@ class RunWriter:
         means = dict(zip(self.run.metrics, values.tolist(), strict=True))
         self.logs.metrics({"updates": counters.updates, "steps": counters.steps, **means, "seconds": self._seconds()})
         yield UpdatesLogged(counters.steps, counters.updates, means)
-        yield from self._watch_temperature(means["temperature"])
+        for name, look in SYMPTOMS.items():
+            yield from self._warn_once(name, look(self.run.config.algorithm, means))
 
-    def _watch_temperature(self, temperature: float) -> Iterator[Event]:
-        """Warn once of a learned temperature that explodes or collapses."""
-        low, high = SANE_TEMPERATURES
-        if self.warned_of_temperature or self.run.config.algorithm.temperature == "fixed" or low < temperature < high:
-            return
-        self.warned_of_temperature = True
-        advice = (
-            "the policy cannot reach the target entropy: lower --target-entropy"
-            if temperature >= high
-            else "the policy stays above the target entropy without any bonus: raise --target-entropy"
-        )
-        yield Warned(
-            f"the temperature is {temperature:.3g}, outside {low:g} to {high:g}: {advice}, or lower "
-            "--temperature-learning-rate, or scale the environment's rewards"
-        )
+    def _warn_once(self, name: str, message: str) -> Iterator[Event]:
+        """Say a message, if there is one, unless something of this name has been said in this session."""
+        if message and name not in self.warned_of:
+            self.warned_of.add(name)
+            yield Warned(message)
 
     def log_evaluation(self, episodes: EvaluationEpisodes, best: bool, bias: QBias | None) -> Iterator[Event]:
         """Log an evaluation that the run has taken in, and beside it the terms of its return and the critics' bias."""
@@ -123,9 +114,8 @@ class RunWriter:
         if best:
             self._write_best()
         yield Evaluated(*counted, episodes.total_rewards, best)
-        if bias is not None and bias.pairs == 0 and not self.warned_of_q_bias:
-            self.warned_of_q_bias = True
-            yield Warned(nothing_known(self.run.config.algorithm.discount))
+        if bias is not None and bias.pairs == 0:
+            yield from self._warn_once("Q bias", nothing_known(self.run.config.algorithm.discount))
 
     def _write_best(self) -> None:
         run = self.run

@@ -196,7 +196,7 @@ def compare(
         report: the report's folder; None for `runs`/report.
         environment_arguments: keyword arguments of every environment.
         show: consumes the stream of statuses and returns the last ones, such as `saclab.cli.display.show_grid`.
-        tell: takes what the user should know before it starts.
+        tell: takes what the user should know before it starts, and at the end the report's summary.
         checkpoint_minutes: wall-clock time between checkpoints.
         launcher: "local" for processes on this machine, "ray" for a Ray cluster, which needs the extra `ray`.
         ray_address: where the cluster answers; None for RAY_ADDRESS, else the one on this machine, else a new one.
@@ -232,7 +232,7 @@ def _compare(
     with requests_from_signals() as requests:
         stream = launch(cells, resources.pool(checkpoint_minutes, tracking), requests, resources.batch)
         statuses = (show or last)(reporting(stream, report, tell))
-    return compared(statuses, report, requests.stop)
+    return compared(statuses, report, requests.stop, tell)
 
 
 def reporting(
@@ -246,7 +246,7 @@ def reporting(
         if hangs and not before:
             told = f"nothing goes on but {len(left)} run(s) that hang; until they do or are stopped: report: "
             try:
-                tell(f"{told}{write_page(read_begun(statuses)[0], report)}")
+                tell(f"{told}{write_page(read_begun(statuses)[0], report, tell)}")
             except UserError as error:  # what goes on is worth more
                 tell(f"{told}none ({error})")
         yield statuses
@@ -258,21 +258,23 @@ def read_begun(statuses: Sequence[RunStatus]) -> tuple[list[RunRecord], dict[Pat
     return read_runs([folder for folder in folders if (folder / "config.json").exists()])
 
 
-def write_page(runs: Sequence[RunRecord], report: Path) -> Path | None:
-    """Write the report of runs, one process at a time; None if there are none."""
+def write_page(runs: Sequence[RunRecord], report: Path, tell: Callable[[str], None]) -> Path | None:
+    """Write the report of runs, one process at a time, and tell its summary; None if there are none."""
     from saclab.report.report import write_report
 
     if not runs:
         return None
     with alone_in(report):
-        return write_report([run.path for run in runs], report)
+        return write_report([run.path for run in runs], report, tell=tell)
 
 
-def compared(statuses: Sequence[RunStatus], report: Path, interrupted: int) -> Comparison:
+def compared(
+    statuses: Sequence[RunStatus], report: Path, interrupted: int, tell: Callable[[str], None] = lambda text: None
+) -> Comparison:
     """What came of a grid, with its report in a folder unless the grid was interrupted."""
     failed = {status.cell.folder: status.message for status in statuses if status.status == "failed"}
     runs, damaged = read_begun(statuses)
-    return Comparison(runs, damaged | failed, None if interrupted else write_page(runs, report), interrupted)
+    return Comparison(runs, damaged | failed, None if interrupted else write_page(runs, report, tell), interrupted)
 
 
 def reproduce(
@@ -301,7 +303,7 @@ def reproduce(
         runs: the folder that holds all runs.
         report: the report's folder; None for `runs`/report.
         show: as in `compare`.
-        tell: takes the forecast.
+        tell: takes the forecast, and at the end the report's summary.
         checkpoint_minutes: wall-clock time between checkpoints.
 
     Raises:

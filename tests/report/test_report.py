@@ -17,6 +17,7 @@ from saclab.report import figures
 from saclab.report.page import VIDEO_BYTES
 from saclab.report.page_data import script_safe
 from saclab.report.report import write_report
+from saclab.report.sentences import ONE_SEED
 from saclab.report.tables import latex_escape, markdown_escape
 from saclab.report.train_command import train_command
 from saclab.training.run_folder import read_run
@@ -243,8 +244,13 @@ def test_escapes():
 )
 def test_short_runs_and_missing_metrics_work(tmp_path, options):
     runs = [write_run(tmp_path, variant, **options) for variant in ("sac", "averaged")]
-    page = Page(write_report(runs, tmp_path / "out").read_text())
+    told: list[str] = []
+    page = Page(write_report(runs, tmp_path / "out", tell=told.append).read_text())
     assert "Summary" in page.words
+    summary = [line.partition(": ")[2] for line in told]
+    assert summary[0] == (ONE_SEED if options.get("evaluations", 1) else summary[0])
+    assert all(sentence in page.words for sentence in summary)
+    assert len(summary) >= 1
     assert "Probability that a run of the row" not in page.words  # one seed each: such a number would say nothing
     assert not list((tmp_path / "out" / "figures").glob("improvement-*"))
     if not options.get("finished", True):

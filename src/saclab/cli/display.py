@@ -156,11 +156,6 @@ def show_comparison(result: Comparison, console: Console) -> int:
         console.print("saved; the same command continues where it stopped")
         return EXIT_STATUS.get(result.interrupted, 1)
     if result.report:
-        cells = [(run.config.environment, run.config.variant) for run in result.runs]
-        if len({variant for _, variant in cells}) > 1 and len(set(cells)) == len(cells):
-            from saclab.report.sentences import ONE_SEED  # the table above looks like a ranking, and is none
-
-            console.print(ONE_SEED, highlight=False, soft_wrap=True)
         console.print(f"report: {result.report.resolve()}", markup=False, soft_wrap=True)
     return 1 if result.failed else 0
 

@@ -160,7 +160,7 @@ class Compare:
             self.environments, self.variants, seed_numbers(self.seeds, self.protocol, self.first_seed), self.protocol,
             workers=self.workers, threads=self.threads, batch=self.batch, runs=self.where.runs, name=self.name,
             sweep=parse_sweep(self.sweep), report=self.report,
-            tell=lambda text: console.print(text, soft_wrap=True, highlight=False),
+            tell=lambda text: console.print(text, soft_wrap=True, highlight=False, markup=False),
             environment_arguments=parse_arguments(self.where.environment_arguments),
             show=lambda stream: display.show_grid(stream, console),
             checkpoint_minutes=self.where.checkpoint_minutes, launcher=self.launcher, ray_address=self.ray_address,
@@ -200,7 +200,8 @@ class Reproduce:
             self.environments, self.variants, self.seeds, self.updates, workers=self.workers, batch=self.batch,
             runs=self.runs,
             report=self.report, show=lambda stream: display.show_grid(stream, console),
-            tell=lambda text: console.print(text, soft_wrap=True), checkpoint_minutes=self.checkpoint_minutes,
+            tell=lambda text: console.print(text, soft_wrap=True, markup=False),
+            checkpoint_minutes=self.checkpoint_minutes,
         )  # fmt: skip
         return display.show_comparison(result, console)
 

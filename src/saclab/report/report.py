@@ -13,7 +13,9 @@ from saclab.report.notices import all_notices
 from saclab.report.page import make_page
 from saclab.report.runs import Comparison, read_comparison
 from saclab.report.scores import AggregateScores, EnvironmentScores, aggregate, score_environment
+from saclab.report.sentences import environment_sentences
 from saclab.report.tables import latex, markdown, scores_csv
+from saclab.report.text import shown
 
 
 class Compared(NamedTuple):
@@ -56,7 +58,7 @@ def write_report(
         out: folder of the report; made if it is missing, files of an earlier report are replaced.
         allow_mixed: show runs that are not comparable side by side, in place of refusing.
         strict: refuse if a folder cannot be read, in place of leaving it out.
-        tell: takes a line for each folder that is left out.
+        tell: takes a line for each folder that is left out, then the summary's sentences.
 
     Returns:
         The path of index.html, one self-contained page.
@@ -84,4 +86,7 @@ def write_report(
             f"cannot write the report to {out}: {error.strerror or error}; name another folder (--out; --report of "
             "saclab compare)"
         ) from error
+    for entry in found.scores:
+        for sentence in environment_sentences(entry):
+            tell(f"{shown(entry.environment)}: {sentence}")
     return out / "index.html"

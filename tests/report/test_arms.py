@@ -91,10 +91,18 @@ def test_one_name_is_one_arm_on_all_environments(tmp_path):
     assert arm.settings_text == "polyak_rate 0.0009"
 
 
-def test_the_same_run_under_two_names_is_no_second_run(tmp_path):
-    runs = [write_run(tmp_path, "averaged", 3), write_run(tmp_path, "averaged", 3, name="again")]
+def test_the_same_run_under_two_names_counts_once(tmp_path):
+    """The finished one; of two finished ones that without a name of its own."""
+    again, run = write_run(tmp_path, "averaged", 3, name="again"), write_run(tmp_path, "averaged", 3)
+    other, unfinished = write_run(tmp_path, "sac", 0, name="other"), write_run(tmp_path, "sac", 0, finished=False)
+    comparison = read_comparison([again, run, unfinished, other])
+    assert {each.path for each in comparison.runs} == {run, other}
+    assert sorted(comparison.left_out) == sorted(
+        f"{repeated} is the same experiment with the same seed as {kept}"
+        for repeated, kept in ((again, run), (unfinished, other))
+    )
     with pytest.raises(UserError, match="same experiment with the same seed 3"):
-        read_comparison(runs)
+        read_comparison([again, run], strict=True)
 
 
 def test_a_name_is_read_from_a_path_as_saclab_makes_it_only(tmp_path):

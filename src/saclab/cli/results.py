@@ -190,7 +190,7 @@ class Report:
     out: Path = Path("report")
     """Folder to write to."""
     strict: bool = False
-    """Refuse if a folder cannot be read, in place of leaving it out."""
+    """Refuse if a folder cannot be read, or holds the same run as another, in place of leaving it out."""
     allow_mixed: bool = False
     """Show runs that differ in more than variant, name and seed as well, labelled by what differs, never pooled."""
 

@@ -63,14 +63,14 @@ def of_another_task(run: RunRecord) -> bool:
 
 def all_notices(comparison: Comparison) -> tuple[str, ...]:
     """The notices of every environment, each with its name if there are several, and of what is left out."""
-    several, unreadable = len(comparison.environments) > 1, len(comparison.left_out)
+    several, left_out = len(comparison.environments) > 1, len(comparison.left_out)
     told = [
         f"{shown(environment)}: {notice}" if several else notice
         for environment in comparison.environments
         for notice in notices(comparison.runs_of(environment))
     ]
-    if unreadable:
-        told.append(f"{count_text(unreadable, 'folder')} left out that cannot be read")
+    if left_out:
+        told.append(f"{count_text(left_out, 'folder')} left out, for the reasons below")
     return tuple(told)
 
 

@@ -253,7 +253,7 @@ def settings(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str
 
 
 def left_out(comparison: Comparison) -> str:
-    """The folders that cannot be read, each with its reason."""
+    """The folders that are left out, each with its reason."""
     if not comparison.left_out:
         return ""
     return f'<section id="left-out"><h2>{LEFT_OUT}</h2>{bullets(comparison.left_out)}</section>'

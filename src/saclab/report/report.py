@@ -50,14 +50,14 @@ def write_report(
 ) -> Path:
     """Compare runs and write index.html, report.md, scores.csv, table.tex and figures/*.png, *.svg into `out`.
 
-    Runs may be unfinished, or have no evaluation yet; the report says so. Folders that cannot be read are left out,
-    and listed with their reasons.
+    Runs may be unfinished, or have no evaluation yet; the report says so. Folders that cannot be read, and a run that is
+    another one under another name, are left out and listed with their reasons.
 
     Args:
         runs: run folders.
         out: folder of the report; made if it is missing, files of an earlier report are replaced.
         allow_mixed: show runs that are not comparable side by side, in place of refusing.
-        strict: refuse if a folder cannot be read, in place of leaving it out.
+        strict: refuse if a folder cannot be read, or holds another's run, in place of leaving it out.
         tell: takes a line for each folder that is left out, then the summary's sentences.
 
     Returns:

@@ -58,7 +58,8 @@ class Comparison(NamedTuple):
 def read_comparison(folders: Sequence[Path], allow_mixed: bool = False, strict: bool = False) -> Comparison:
     """Read run folders and group them.
 
-    Folders that cannot be read are left out.
+    Folders that cannot be read are left out, and all but one of those that hold the same experiment with the same seed,
+    unless it is `strict`.
 
     Raises:
         UserError: if none can be read, if one cannot and it is `strict`, and as `group_runs` does.
@@ -68,6 +69,9 @@ def read_comparison(folders: Sequence[Path], allow_mixed: bool = False, strict: 
         more = f" (and {len(left_out) - 1} more)" if len(left_out) > 1 else ""
         raise UserError(f"{len(left_out)} of {len(runs) + len(left_out)} folders cannot be read: "
                         f"{shown(next(iter(left_out.values())), 1000)}{more}")  # fmt: skip
+    if not strict:
+        runs, repeated = each_once(runs)
+        left_out |= repeated
     return group_runs(runs, allow_mixed)._replace(left_out=tuple(shown(reason, 1000) for reason in left_out.values()))
 
 
@@ -130,14 +134,31 @@ def arm_key(run: RunRecord) -> tuple[str | None, ...]:
     return (config.variant, name, None if name is not None and is_known(config) else config.environment)
 
 
+def each_once(runs: Sequence[RunRecord]) -> tuple[list[RunRecord], dict[Path, str]]:
+    """Runs of which no two are the same experiment, and why the others are left out.
+
+    A finished one stays before others, then one without a name of its own.
+    """
+    kept: dict[str, RunRecord] = {}
+    repeated: dict[Path, str] = {}
+    for run in sorted(runs, key=lambda run: (run.result is None, own_name(run) is not None, str(run.path))):
+        if (same := kept.setdefault(experiment_of(run), run)) is not run:
+            repeated[run.path] = f"{run.path} is the same experiment with the same seed as {same.path}"
+    return list(kept.values()), repeated
+
+
 def require_independent(runs: Sequence[RunRecord]) -> None:
     """Raise UserError for two runs that are the same experiment under two names."""
     seen: dict[str, RunRecord] = {}
     for run in runs:
-        config = run.config
-        experiment = repr((config.environment, config.variant, config.seed, asdict(config.algorithm), conditions(run)))
-        if (same := seen.setdefault(experiment, run)) is not run:
+        if (same := seen.setdefault(experiment_of(run), run)) is not run:
             raise not_independent(same, run)
+
+
+def experiment_of(run: RunRecord) -> str:
+    """What decides a run's result, but for the machine: two runs that have it in common are one."""
+    config = run.config
+    return repr((config.environment, config.variant, config.seed, asdict(config.algorithm), conditions(run)))
 
 
 def not_independent(first: RunRecord, second: RunRecord) -> UserError:

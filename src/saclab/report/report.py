@@ -50,8 +50,8 @@ def write_report(
 ) -> Path:
     """Compare runs and write index.html, report.md, scores.csv, table.tex and figures/*.png, *.svg into `out`.
 
-    Runs may be unfinished, or have no evaluation yet; the report says so. Folders that cannot be read, and a run that is
-    another one under another name, are left out and listed with their reasons.
+    Runs may be unfinished, or have no evaluation yet; the report says so. Folders that cannot be read, and a run that
+    is another one under another name, are left out and listed with their reasons.
 
     Args:
         runs: run folders.

@@ -11,10 +11,10 @@ import saclab
 
 HOUSE = Path(saclab.__file__).parent
 ROOMS = (
-    "errors", "extras", "files", "limits", "reward_schedule", "refusals", "settings", "config", "variants", "protocols",
-    "machine", "records", "hub", "algorithm", "environments", "replay", "memory", "trained_policy", "onnx_export",
-    "training", "signals", "exits", "trackers", "batch", "grid", "report", "playback", "play", "sharing", "tuning",
-    "api", "cli",
+    "errors", "extras", "files", "limits", "other_names", "reward_schedule", "refusals", "settings", "config",
+    "variants", "protocols", "machine", "records", "hub", "algorithm", "environments", "replay", "memory",
+    "trained_policy", "onnx_export", "training", "signals", "exits", "trackers", "batch", "grid", "report",
+    "playback", "play", "sharing", "tuning", "api", "cli",
 )  # fmt: skip
 """From the ground up: a room imports itself and what stands before it."""
 FILE_LINES, FUNCTION_LINES, NAME_LETTERS = 350, 55, 70

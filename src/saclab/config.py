@@ -13,7 +13,8 @@ from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
-from saclab.errors import UserError, require, unknown_name
+from saclab.errors import UserError, require
+from saclab.other_names import unknown_setting
 from saclab.settings import AlgorithmSettings, TrainingSettings, structure
 
 Plain = TypeVar("Plain")
@@ -109,7 +110,7 @@ def require_known_names(kind: Any, values: object) -> None:
     hints = get_type_hints(kind)
     for name, value in values.items() if isinstance(values, dict) else ():
         if name not in hints:
-            raise unknown_name("setting", name, hints)
+            raise unknown_setting(name, hints)
         if dataclasses.is_dataclass(hints[name]):
             require_known_names(hints[name], value)
 

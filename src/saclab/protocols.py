@@ -13,6 +13,7 @@ import msgspec
 from saclab.config import Config
 from saclab.errors import SettingError, require, unknown_name
 from saclab.files import absolute
+from saclab.other_names import unknown_setting
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names, replace_settings
 from saclab.variants import default_settings, needed_settings, task_name, variant_changes
 
@@ -235,7 +236,7 @@ def split_settings(settings: Mapping[str, Any]) -> tuple[dict[str, Any], dict[st
     algorithm_names, training_names = field_names(AlgorithmSettings), field_names(TrainingSettings)
     for name in settings:
         if name not in algorithm_names + training_names:
-            raise unknown_name("setting", name, algorithm_names + training_names)
+            raise unknown_setting(name, algorithm_names + training_names)
     return (
         {name: value for name, value in settings.items() if name in algorithm_names},
         {name: value for name, value in settings.items() if name in training_names},

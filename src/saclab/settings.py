@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from saclab.errors import require, unknown_name
+from saclab.errors import require
 from saclab.limits import require_representable
+from saclab.other_names import unknown_setting
 from saclab.refusals import UPDATES, require_known, require_possible, require_prefill, require_ranges
 from saclab.reward_schedule import ScheduledTerm, parse_schedule
 
@@ -312,7 +313,7 @@ def replace_settings(settings: Settings, overrides: Mapping[str, Any]) -> Settin
     known = field_names(type(settings))
     for name in overrides:
         if name not in known:
-            raise unknown_name("setting", name, known)
+            raise unknown_setting(name, known)
     return dataclasses.replace(settings, **overrides)
 
 

@@ -7,6 +7,8 @@ import pytest
 from saclab.cli.main import parse
 from saclab.cli.settings import docstrings, named_config
 from saclab.errors import UserError
+from saclab.other_names import OTHER_NAMES
+from saclab.protocols import make_config
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
 
@@ -46,6 +48,32 @@ def test_help_shows_what_the_named_variant_and_protocol_have(capsys):
         assert f"or its first value if it is learned. (default: {0.1 if words[0] == 'train' else 0.2})" in told
     with pytest.raises(UserError, match="did you mean 'averaged'"):
         named_config(["train", "--variant", "averagd"])
+
+
+@pytest.mark.parametrize("words", [("train", "A-v0", "--gamma", "0.9"), ("compare", "A-v0", "--gamma=0.9")])
+def test_another_librarys_name_is_told_as_ours(words):
+    with pytest.raises(UserError, match=r"^unknown option --gamma: here it is --discount$"):
+        parse(words)
+    with pytest.raises(
+        UserError, match=r"^unknown setting 'lr': here it is actor_learning_rate, critic_learning_rate,"
+    ):
+        make_config("Pendulum-v1", overrides={"lr": 1e-3})
+
+
+def test_other_names_lead_to_settings_and_are_none():
+    ours = {*field_names(AlgorithmSettings), *field_names(TrainingSettings)}
+    assert {name for names in OTHER_NAMES.values() for name in names} <= ours
+    assert not OTHER_NAMES.keys() & ours
+
+
+def test_a_wrong_option_is_told_of_for_its_own_command_alone(capsys):
+    with pytest.raises(SystemExit):
+        parse(["compare", "A-v0", "--seed", "3"])
+    told = capsys.readouterr()
+    told = told.out + told.err
+    assert "--first-seed" in told
+    assert "saclab compare --help" in told
+    assert "--search-seed" not in told, "which is tune's"
 
 
 def test_every_setting_has_an_explanation():

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Annotated, Any, Union
 
 import tyro
 from tyro.conf import subcommand
@@ -18,6 +18,7 @@ from saclab.cli.training import Compare, Reproduce, Resume, Train
 from saclab.cli.tuning import Tune
 from saclab.errors import for_terminal
 from saclab.exits import EXIT_FAILED, end_after
+from saclab.other_names import require_own_names
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,24 +52,39 @@ def run(arguments: Sequence[str]) -> int:
     return int(command(Console()))
 
 
+COMMANDS: dict[str, type] = {
+    "train": Train,
+    "compare": Compare,
+    "tune": Tune,
+    "reproduce": Reproduce,
+    "resume": Resume,
+    "report": Report,
+    "watch": Watch,
+    "evaluate": Evaluate,
+    "record": Record,
+    "play": Play,
+    "export": Export,
+    "share": Share,
+    "variants": Variants,
+    "protocols": Protocols,
+}
+WITH_SETTINGS = ("train", "compare", "tune")
+"""The commands that have an option for each setting of a run."""
+
+
 def parse(arguments: Sequence[str]) -> Any:
     """The command that the words ask for."""
-    train, compare, tune = (with_settings(command, arguments) for command in (Train, Compare, Tune))
-    commands: Any = (
-        Annotated[train, subcommand("train")]
-        | Annotated[compare, subcommand("compare")]
-        | Annotated[tune, subcommand("tune")]
-        | Annotated[Reproduce, subcommand("reproduce")]
-        | Annotated[Resume, subcommand("resume")]
-        | Annotated[Report, subcommand("report")]
-        | Annotated[Watch, subcommand("watch")]
-        | Annotated[Evaluate, subcommand("evaluate")]
-        | Annotated[Record, subcommand("record")]
-        | Annotated[Play, subcommand("play")]
-        | Annotated[Export, subcommand("export")]
-        | Annotated[Share, subcommand("share")]
-        | Annotated[Variants, subcommand("variants")]
-        | Annotated[Protocols, subcommand("protocols")]
-    )
+    name, *words = arguments
+    if name in WITH_SETTINGS:
+        require_own_names(words)
+    if name in COMMANDS:  # what is said of a wrong word is about this command, and not about all that have one like it
+        return tyro.cli(command_of(name, arguments), prog=f"saclab {name}", args=words)
+    every: Any = Union[*(Annotated[command_of(each, arguments), subcommand(each)] for each in COMMANDS)]
     description = "A laboratory for Soft Actor-Critic: train its variants, compare them, reproduce the paper."
-    return tyro.cli(commands, prog="saclab", description=description, args=list(arguments))
+    return tyro.cli(every, prog="saclab", description=description, args=list(arguments))
+
+
+def command_of(name: str, arguments: Sequence[str]) -> type:
+    """A command as the parser takes it."""
+    command = COMMANDS[name]
+    return with_settings(command, arguments) if name in WITH_SETTINGS else command

@@ -9,9 +9,9 @@ import json
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from saclab.errors import SettingError
 from saclab.protocols import PROTOCOLS
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Evaluate:
     """Evaluate a run's best policy on fresh episodes."""
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     episodes: int = 20
     """How many episodes, stepped side by side."""
@@ -56,7 +56,7 @@ class Evaluate:
 class Record:
     """Film a run's best policy; needs no screen."""
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     video: Path | None = None
     """File to write, .mp4 or .gif; None for video.mp4 beside the policy, where the report finds it, or for name.mp4
@@ -91,7 +91,7 @@ def beside(run: Path, ending: str) -> Path | None:
 class Play:
     """Show a run's best policy in a window, episode after episode, until it is closed or Ctrl-C."""
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     episodes: int | None = None
     """How many episodes; None for no end."""
@@ -123,7 +123,7 @@ class Export:
     sampled_action; within the environment's bounds, and of its type.
     """
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """The run folder, a folder that holds a policy, or hf:user/name[@revision] of the Hugging Face Hub."""
     out: Path | None = None
     """File to write; None for policy.onnx beside the policy, or for name.onnx here if that is the Hub's."""
@@ -146,7 +146,7 @@ class Share:
     evaluations.csv, a film, the card.
     """
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """The run folder."""
     repository: Positional[str]
     """user/name on the Hub; made if there is none."""
@@ -185,7 +185,7 @@ class Share:
 class Report:
     """Write the comparison of finished and unfinished runs: a page, figures, tables."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="[RUN ...]")]]
     """Run folders, or folders that hold some."""
     out: Path = Path("report")
     """Folder to write to."""
@@ -210,7 +210,7 @@ class Report:
 class Watch:
     """Show the report's page in the browser while its runs go on; what you have chosen on it stays chosen."""
 
-    runs: Positional[tuple[Path, ...]]
+    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="[RUN ...]")]]
     """Run folders, or folders that hold some."""
     port: int = 8642
     """Of this machine's own address, 127.0.0.1; 0 for any that is free."""

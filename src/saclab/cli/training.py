@@ -9,10 +9,10 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
-from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from saclab.config import Config
 from saclab.errors import SettingError
@@ -44,7 +44,7 @@ class Where:
 class Train:
     """Train one run; finds and continues it if it was stopped. Every setting below can be changed."""
 
-    environment: Positional[str]
+    environment: Positional[Annotated[str, arg(metavar="ENVIRONMENT")]]
     """Gymnasium id, such as HalfCheetah-v4, or package.module:Name-v0 to import the package first."""
     algorithm: Given
     training: Given
@@ -78,7 +78,7 @@ class Train:
 class Resume:
     """Continue a run from its newest checkpoint."""
 
-    run: Positional[Path]
+    run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """The run folder."""
     checkpoint_minutes: float = 10
     """Wall-clock time between checkpoints."""
@@ -107,7 +107,7 @@ class Compare:
     that is given is changed in every run.
     """
 
-    environments: Positional[tuple[str, ...]]
+    environments: Positional[Annotated[tuple[str, ...], arg(metavar="[ENVIRONMENT ...]")]]
     """Gymnasium ids."""
     algorithm: Given
     training: Given

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from saclab.cli.training import Given, parse_arguments
 
@@ -49,7 +49,7 @@ class Tune:
     settings shown below are the protocol's; one that is given holds for every trial and is not searched.
     """
 
-    environment: Positional[str]
+    environment: Positional[Annotated[str, arg(metavar="ENVIRONMENT")]]
     """Gymnasium id, such as HalfCheetah-v4, or package.module:Name-v0 to import the package first."""
     algorithm: Given
     training: Given

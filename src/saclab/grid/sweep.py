@@ -8,7 +8,8 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 
 import msgspec
 
-from saclab.errors import SettingError, require, unknown_name
+from saclab.errors import SettingError, require
+from saclab.other_names import unknown_setting
 from saclab.reward_schedule import SETTING as SCHEDULE
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
@@ -89,7 +90,7 @@ def require_algorithm_setting(name: str) -> None:
             "algorithm, and compare this one in reports of its own",
         )  # fmt: skip
     if name not in known:
-        raise unknown_name("setting", name, known)
+        raise unknown_setting(name, known)
 
 
 def value_name(value: Any) -> str:

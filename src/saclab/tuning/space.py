@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import msgspec
 
-from saclab.errors import SettingError, UserError, require, unknown_name
+from saclab.errors import SettingError, UserError, require
+from saclab.other_names import unknown_setting
 from saclab.settings import AlgorithmSettings, TrainingSettings, field_names
 
 if TYPE_CHECKING:
@@ -138,7 +139,7 @@ def require_searchable(name: str) -> None:
     """Raise UserError for what is no setting, or cannot be searched."""
     known = (*field_names(AlgorithmSettings), *field_names(TrainingSettings))
     if name not in known:
-        raise unknown_name("setting", name, known)
+        raise unknown_setting(name, known)
     require(
         name not in NOT_SEARCHED, "space", name,
         "all trials must agree in it: give it as an option, which holds for every trial",

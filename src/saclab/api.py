@@ -225,7 +225,7 @@ def _compare(
 ) -> Comparison:
     require_minutes(checkpoint_minutes)
     for cell in [cell for cell in cells if not cell.finished][:1]:
-        tracking.trackers(*cell)  # before anything is started; and MLflow's experiment is made by one process
+        tracking.usable(*cell)  # said before anything is started; and MLflow's experiment is made by one process
     report = absolute(report)
     if note := resources.note(cells):
         tell(note)
@@ -246,7 +246,7 @@ def reporting(
         if hangs and not before:
             told = f"nothing goes on but {len(left)} run(s) that hang; until they do or are stopped: report: "
             try:
-                tell(f"{told}{write_page(read_begun(statuses)[0], report, tell)}")
+                tell(f"{told}{write_page(read_begun(statuses)[0], report)}")
             except UserError as error:  # what goes on is worth more
                 tell(f"{told}none ({error})")
         yield statuses
@@ -258,7 +258,7 @@ def read_begun(statuses: Sequence[RunStatus]) -> tuple[list[RunRecord], dict[Pat
     return read_runs([folder for folder in folders if (folder / "config.json").exists()])
 
 
-def write_page(runs: Sequence[RunRecord], report: Path, tell: Callable[[str], None]) -> Path | None:
+def write_page(runs: Sequence[RunRecord], report: Path, tell: Callable[[str], None] = lambda text: None) -> Path | None:
     """Write the report of runs, one process at a time, and tell its summary; None if there are none."""
     from saclab.report.report import write_report
 

@@ -92,14 +92,15 @@ def test_one_name_is_one_arm_on_all_environments(tmp_path):
 
 
 def test_the_same_run_under_two_names_counts_once(tmp_path):
-    """The finished one; of two finished ones that without a name of its own."""
+    """In the arm that has more finished runs, then in that without a name of its own; no arm is torn in two."""
     again, run = write_run(tmp_path, "averaged", 3, name="again"), write_run(tmp_path, "averaged", 3)
-    other, unfinished = write_run(tmp_path, "sac", 0, name="other"), write_run(tmp_path, "sac", 0, finished=False)
-    comparison = read_comparison([again, run, unfinished, other])
-    assert {each.path for each in comparison.runs} == {run, other}
+    others = [write_run(tmp_path, "sac", seed, name="other") for seed in (0, 1)]
+    fewer = [write_run(tmp_path, "sac", seed, finished=seed == 0) for seed in (0, 1)]
+    comparison = read_comparison([again, run, *fewer, *others])
+    assert {each.path for each in comparison.runs} == {run, *others}
     assert sorted(comparison.left_out) == sorted(
         f"{repeated} is the same experiment with the same seed as {kept}"
-        for repeated, kept in ((again, run), (unfinished, other))
+        for repeated, kept in ((again, run), *zip(fewer, others))
     )
     with pytest.raises(UserError, match="same experiment with the same seed 3"):
         read_comparison([again, run], strict=True)

@@ -68,7 +68,7 @@ def test_one_bad_folder_does_not_stop_the_report(folders, tmp_path):
         assert reason.replace("'", "&#x27;") in written[0]
         assert reason in written[1]
     for text in written:
-        assert "6 folders left out, for the reasons below" in text
+        assert "6 folders left out; the report" in text
     with (tmp_path / "report" / "scores.csv").open() as file:
         assert [row["seed"] for row in csv.DictReader(file)] == ["0", "1"]
 

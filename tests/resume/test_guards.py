@@ -128,6 +128,7 @@ def test_a_runaway_temperature_is_told_once_with_advice(tmp_path, monkeypatch, s
         ("categorical", 5.0, "none", -4.6, "cuts off what lies beyond 5: raise --critic-bound, or scale rewards"),
         ("categorical", 5.0, "deviation", 4.6, "cuts off what lies beyond 5: raise --critic-bound"),
         ("categorical", 5.0, "none", 4.4, ""),
+        ("categorical", 5.0, "deviation_or_bound", 4.9, ""),
         ("scalar", 5.0, "none", 4.6, ""),
     ],
 )

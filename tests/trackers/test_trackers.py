@@ -74,6 +74,9 @@ class Noting:
             raise ValueError("out of order")
         self.noted.append((what, *values))
 
+    def check(self) -> None:
+        self.note("check")
+
     def open(self, started: events.Started) -> None:
         self.note("open", started.run)
 
@@ -82,6 +85,10 @@ class Noting:
 
     def close(self, finished: bool) -> None:
         self.note("close", finished)
+
+
+class Sound(Noting):
+    """Of another kind."""
 
 
 LOSS = {"critic_loss": 1.0}
@@ -106,22 +113,26 @@ def test_each_run_of_a_group_has_trackers_of_its_own():
 
 @pytest.mark.parametrize(
     ("breaks_at", "said", "noted"),
-    [("log", "Noting gets nothing more, and the run goes on: ", ["open"]),
+    [("open", "Noting cannot be used, and the run goes on without it: ", []),
+     ("log", "Noting gets nothing more, and the run goes on: ", ["open"]),
      ("close", "Noting did not get the run's last numbers: ", ["open", "log", "log"])],
 )  # fmt: skip
 def test_a_tracker_that_breaks_is_warned_of_once_and_others_go_on(breaks_at, said, noted):
-    broken, sound = Noting(breaks_at), Noting()
+    broken, sound = Noting(breaks_at), Sound()
     passed = list(track_runs(OF_TWO_RUNS, [[broken, sound], []]))
     (warned,) = [each for each in passed if each not in OF_TWO_RUNS]
     assert warned[0] == 0
     assert warned[1].message.startswith(said)
+    assert "out of order" in warned[1].message
     assert [what for what, *_ in broken.noted] == noted
     assert [what for what, *_ in sound.noted] == ["open", "log", "log", "close"]
 
 
-def test_a_tracker_that_cannot_be_opened_refuses_the_run():
-    with pytest.raises(UserError, match=r"Noting cannot be used: .*out of order"):
-        list(track_runs(OF_TWO_RUNS, [[Noting("open")], []]))
+def test_a_service_that_failed_one_run_of_a_group_is_not_asked_again():
+    first, second = Noting(), Noting("log")
+    passed = list(track_runs(OF_TWO_RUNS, [[first], [second]]))
+    assert len(passed) == len(OF_TWO_RUNS) + 1
+    assert [what for what, *_ in first.noted] == [what for what, *_ in second.noted] == ["open"]
 
 
 def test_trackers_are_closed_when_nobody_goes_on_with_the_runs():
@@ -243,7 +254,7 @@ def test_a_server_that_does_not_answer_is_named(mlflow: Any, monkeypatch: pytest
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:9")
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
     with pytest.raises(UserError, match=r"--mlflow e: http://127.0.0.1:9 cannot be used: .*MLFLOW_TRACKING_URI"):
-        services.MLflow("e", config)
+        Tracking(mlflow="e").usable(config, Path("run"))
 
 
 def test_a_missing_extra_says_how_to_install_it() -> None:

@@ -148,7 +148,7 @@ class Share:
 
     run: Positional[Annotated[Path, arg(metavar="RUN")]]
     """The run folder."""
-    repository: Positional[str]
+    repository: Positional[Annotated[str, arg(metavar="USER/NAME")]]
     """user/name on the Hub; made if there is none."""
     folder: Path | None = None
     """Write there what would be sent, for a look at it, and send nothing."""

@@ -243,7 +243,7 @@ def train_and_show(
     with requests_from_signals(process_ends=True) as requests:
         stream: Iterable[Event] = train(config, folder, requests, checkpoint_minutes)
         if tracking.any and not finished:
-            stream = track(stream, tracking.trackers(config, folder))
+            stream = track(stream, tracking.usable(config, folder))
         for _ in display.show_run(stream, console):
             pass
         if requests.stop:

@@ -20,7 +20,7 @@ from saclab.grid.pool import POLL_SECONDS, End, Report, WorkerPool
 from saclab.grid.tasks import Task
 from saclab.grid.worker_process import WorkerProcess
 from saclab.machine import thread_limits
-from saclab.trackers.asked import NOWHERE, VARIABLES, Tracking
+from saclab.trackers.asked import NOWHERE, VARIABLES, WANDB_HERE, Tracking
 
 PATIENCE = 90  # seconds; a machine that the cluster has lost needs a minute to notice and to end its workers
 GPU_MEMORY = 0.75  # of a GPU, which JAX takes at its start; those that share one take it of their share
@@ -142,5 +142,5 @@ def worker_variables(threads: int, gpus: float) -> dict[str, str]:
     others Ray has named theirs in CUDA_VISIBLE_DEVICES.
     """
     share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{GPU_MEMORY * gpus:.3f}"} if gpus < 1 else {}
-    told = {name: value for name, value in os.environ.items() if name.startswith(TOLD)}
+    told = {name: value for name, value in os.environ.items() if name.startswith(TOLD) and name != WANDB_HERE}
     return ({"CUDA_VISIBLE_DEVICES": ""} if gpus == 0 else share) | told | thread_limits(threads)

@@ -70,7 +70,7 @@ def all_notices(comparison: Comparison) -> tuple[str, ...]:
         for notice in notices(comparison.runs_of(environment))
     ]
     if left_out:
-        told.append(f"{count_text(left_out, 'folder')} left out, for the reasons below")
+        told.append(f"{count_text(left_out, 'folder')} left out; the report's page lists why")
     return tuple(told)
 
 

@@ -23,7 +23,7 @@ from saclab.report.pairs import Pair
 from saclab.report.paper import CURVE_ACCURACY, SOURCE
 from saclab.report.runs import Comparison
 from saclab.report.scores import AggregateScores, EnvironmentScores
-from saclab.report.sentences import aggregate_sentences, environment_sentences
+from saclab.report.sentences import summary_sentences
 from saclab.report.tables import (
     LEFT_OUT,
     Table,
@@ -96,11 +96,9 @@ def lead(comparison: Comparison) -> str:
 
 def summary(comparison: Comparison, scores: Sequence[EnvironmentScores], together: AggregateScores | None) -> str:
     """The answer first: sentences for each environment, and what the arms with a name of their own are."""
-    parts = []
-    for entry in scores:
-        parts.append(f"<h3>{escape(shown(entry.environment))}</h3>{bullets(environment_sentences(entry))}")
-    if together is not None:
-        parts.append(f"<h3>All environments together</h3>{bullets(aggregate_sentences(together))}")
+    parts = [
+        f"<h3>{escape(title)}</h3>{bullets(sentences)}" for title, sentences in summary_sentences(scores, together)
+    ]
     arms = arms_table(comparison)
     if arms.rows:
         parts.append(f"<h3>{escape(arms.title)}</h3>{table_html(arms, headed=True)}")

@@ -13,9 +13,8 @@ from saclab.report.notices import all_notices
 from saclab.report.page import make_page
 from saclab.report.runs import Comparison, read_comparison
 from saclab.report.scores import AggregateScores, EnvironmentScores, aggregate, score_environment
-from saclab.report.sentences import environment_sentences
+from saclab.report.sentences import summary_sentences
 from saclab.report.tables import latex, markdown, scores_csv
-from saclab.report.text import shown
 
 
 class Compared(NamedTuple):
@@ -64,8 +63,8 @@ def write_report(
         The path of index.html, one self-contained page.
 
     Raises:
-        UserError: if no folder can be read, for runs that are not comparable, two runs of one experiment and seed, or
-            a place that cannot be written to.
+        UserError: if no folder can be read, for runs that are not comparable, for what `strict` refuses, or for a place
+            that cannot be written to.
     """
     found = compared(runs, allow_mixed, strict)
     for reason in found.comparison.left_out:
@@ -86,7 +85,7 @@ def write_report(
             f"cannot write the report to {out}: {error.strerror or error}; name another folder (--out; --report of "
             "saclab compare)"
         ) from error
-    for entry in found.scores:
-        for sentence in environment_sentences(entry):
-            tell(f"{shown(entry.environment)}: {sentence}")
+    for title, sentences in summary_sentences(found.scores, found.together):
+        for sentence in sentences:
+            tell(f"{title}: {sentence}")
     return out / "index.html"

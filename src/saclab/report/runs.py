@@ -42,7 +42,7 @@ class Comparison(NamedTuple):
     mixed: tuple[str, ...]
     """The differences that were accepted, each a sentence; empty if all runs are comparable."""
     left_out: tuple[str, ...] = ()
-    """Why folders could not be read, each a sentence."""
+    """Why folders are left out, each a sentence."""
 
     def arms_of(self, environment: str) -> tuple[Arm, ...]:
         return tuple(arm for arm in self.arms if (environment, arm) in self.groups)
@@ -137,11 +137,12 @@ def arm_key(run: RunRecord) -> tuple[str | None, ...]:
 def each_once(runs: Sequence[RunRecord]) -> tuple[list[RunRecord], dict[Path, str]]:
     """Runs of which no two are the same experiment, and why the others are left out.
 
-    A finished one stays before others, then one without a name of its own.
+    Those stay whose arm has more finished runs, then those without a name of their own: an arm is not torn in two.
     """
+    finished = Counter(run.path.parent for run in runs if run.result is not None)
     kept: dict[str, RunRecord] = {}
     repeated: dict[Path, str] = {}
-    for run in sorted(runs, key=lambda run: (run.result is None, own_name(run) is not None, str(run.path))):
+    for run in sorted(runs, key=lambda run: (-finished[run.path.parent], own_name(run) is not None, str(run.path))):
         if (same := kept.setdefault(experiment_of(run), run)) is not run:
             repeated[run.path] = f"{run.path} is the same experiment with the same seed as {same.path}"
     return list(kept.values()), repeated

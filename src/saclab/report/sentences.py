@@ -9,13 +9,21 @@ import numpy as np
 from saclab.report.pairs import Pair
 from saclab.report.scores import AggregateScores, ArmScores, EnvironmentScores
 from saclab.report.statistics import FEW_RUNS, Improvement, runs_needed
-from saclab.report.text import count_text, interval_text, number_text
+from saclab.report.text import count_text, interval_text, number_text, shown
 
 MORE_SEEDS = "More seeds can change that: compare again with --seeds 5; finished runs are kept."
 ONE_SEED = f"One seed of each variant allows no conclusion about which is better. {MORE_SEEDS}"
 MANY_ARMS = 5
 """Number of arms from which on they are ranked, an arm that beats others takes one sentence, and so do all pairs that
 cannot be told apart."""
+
+
+def summary_sentences(
+    scores: Sequence[EnvironmentScores], together: AggregateScores | None
+) -> list[tuple[str, list[str]]]:
+    """The answer first: for each environment, then for all of them together, a title and sentences."""
+    found = [(shown(entry.environment), environment_sentences(entry)) for entry in scores]
+    return found if together is None else [*found, ("All environments together", aggregate_sentences(together))]
 
 
 def environment_sentences(scores: EnvironmentScores) -> list[str]:

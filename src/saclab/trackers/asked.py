@@ -29,7 +29,7 @@ class Tracking:
         return self.tensorboard or self.wandb is not None or self.mlflow is not None
 
     def trackers(self, config: Config, folder: Path) -> list[Tracker]:
-        """Those that were asked for, of a run; raises UserError if an extra is missing or MLflow cannot be used."""
+        """Those that were asked for, of a run; raises UserError if an extra is missing."""
         from saclab.trackers import services
 
         chosen: list[Tracker] = []
@@ -41,10 +41,19 @@ class Tracking:
             chosen.append(services.MLflow(self.mlflow, config))
         return chosen
 
+    def usable(self, config: Config, folder: Path) -> list[Tracker]:
+        """The same; raises UserError too if a service does not answer or will not have this user."""
+        found = self.trackers(config, folder)
+        for tracker in found:
+            tracker.check()
+        return found
+
 
 NOWHERE = Tracking()
 VARIABLES = ("WANDB_", "MLFLOW_")
 """What the names of environment variables begin with by which a user tells trackers where to send to, and as whom."""
+WANDB_HERE = "WANDB_SERVICE"
+"""The one that is about a process of this machine."""
 
 
 def trackers_of(tracking: Tracking, runs: Sequence[tuple[Config, Path]]) -> list[list[Tracker]]:

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Protocol
 
-from saclab.errors import UserError, in_words
+from saclab.errors import in_words
 from saclab.training import events
 
 
 class Tracker(Protocol):
     """What takes a run's numbers."""
+
+    def check(self) -> None:
+        """Whether it can be used at all; raises UserError if not."""
 
     def open(self, started: events.Started) -> None:
         """Begin with a run, or go on with a resumed one."""
@@ -52,14 +55,10 @@ class Feed:
         return type(self.tracker).__name__
 
     def take(self, event: events.Event) -> str:
-        """Pass an event on; what is to be told of it, or nothing.
-
-        Raises:
-            UserError: if the tracker cannot be opened.
-        """
+        """Pass an event on; what went wrong, or nothing."""
         match event:
             case events.Started():
-                self._open(event)
+                return self._open(event)
             case events.Finished():
                 return self.close(finished=True)
             case events.Interrupted() | events.Failed():
@@ -73,15 +72,16 @@ class Feed:
             return f"{self.kind} gets nothing more, and the run goes on: {in_words(error)}"
         return ""
 
-    def _open(self, started: events.Started) -> None:
+    def _open(self, started: events.Started) -> str:
         try:
             self.tracker.open(started)
         except Exception as error:
-            raise UserError(f"{self.kind} cannot be used: {in_words(error)}") from error
+            return f"{self.kind} cannot be used, and the run goes on without it: {in_words(error)}"
         self.going = True
+        return ""
 
     def close(self, finished: bool) -> str:
-        """Nothing comes any more; what is to be told of it, or nothing. Once is enough."""
+        """Nothing comes any more; what went wrong, or nothing. Once is enough."""
         if not self.going:
             return ""
         self.going = False
@@ -97,18 +97,22 @@ def track_runs(
 ) -> Iterator[tuple[int, events.Event]]:
     """Pass on the events of runs, each with the place of its run, and send their numbers to the trackers of each.
 
-    Raises:
-        UserError: if a tracker cannot be opened. One that breaks later is warned of.
+    What goes wrong is warned of. A service that has failed one run gets nothing more of the others either: they are
+    stepped together, and would wait for it one after the other.
     """
     feeds = [[Feed(tracker) for tracker in of_run] for of_run in trackers]
+    failed = set[str]()
     try:
         for run, event in stream:
-            for told in filter(None, [feed.take(event) for feed in feeds[run]]):
-                yield run, events.Warned(told)
+            for feed in feeds[run]:
+                if feed.kind not in failed and (told := feed.take(event)):
+                    failed.add(feed.kind)
+                    yield run, events.Warned(told)
             yield run, event
     finally:
         for feed in chain.from_iterable(feeds):  # of runs that broke, or that nobody goes on with
-            feed.close(finished=False)
+            if feed.kind not in failed:
+                feed.close(finished=False)
 
 
 def track(stream: Iterable[events.Event], trackers: Sequence[Tracker]) -> Iterator[events.Event]:

@@ -28,6 +28,9 @@ class TensorBoard:
         """Raises UserError if the extra is not installed."""
         self.writer_type: Any = required("tensorboardX", "tensorboard", "--tensorboard").SummaryWriter
 
+    def check(self) -> None:
+        """Files can be written as soon as there is a run folder."""
+
     def open(self, started: events.Started) -> None:
         self.writer = self.writer_type(str(started.run / "tensorboard"), purge_step=started.resumed_at_step + 1)
 
@@ -50,6 +53,15 @@ class WeightsAndBiases:
         self.project, self.config, self.folder = project, config, folder
         self.module: Any = required("wandb", "wandb", "--wandb")
 
+    def check(self) -> None:
+        """Ask for the key at a terminal, if there is none yet."""
+        try:
+            ready = self.module.setup().settings.mode != "online" or self.module.login()
+        except Exception as error:
+            raise UserError(f"--wandb {self.project}: {in_words(error)}; {LOGIN}") from error
+        if not ready:
+            raise UserError(f"--wandb {self.project}: not logged in; {LOGIN}")
+
     def open(self, started: events.Started) -> None:
         name = name_of(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -66,6 +78,7 @@ class WeightsAndBiases:
         self.run.finish()
 
 
+LOGIN = "use `wandb login` or WANDB_API_KEY, or WANDB_MODE=offline to keep it on this machine"
 PATIENCE = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}
 """MLflow's own are minutes of silence before a server that does not answer is told of."""
 
@@ -81,28 +94,29 @@ class MLflow:
     """Numbers are sent together: a request takes as long as several steps."""
 
     def __init__(self, experiment: str, config: Config) -> None:
-        """Make the experiment if there is none.
-
-        Raises:
-            UserError: if the extra is not installed, or MLflow cannot be reached or used.
-        """
+        """Raises UserError if the extra is not installed."""
         for name, value in PATIENCE.items():
             os.environ.setdefault(name, value)
         self.mlflow: Any = required("mlflow", "mlflow", "--mlflow")
-        self.config = config
-        try:
-            self.experiment = self.mlflow.set_experiment(experiment).experiment_id
-            self.client = self.mlflow.MlflowClient()
-        except Exception as error:
-            place = self.mlflow.get_tracking_uri()
-            raise UserError(
-                f"--mlflow {experiment}: {place} cannot be used: {in_words(error)}; the environment variable "
-                "MLFLOW_TRACKING_URI names a server or a database"
-            ) from error
+        self.name, self.config = experiment, config
         self.held: list[Any] = []
         self.sent_at = time.monotonic()
 
+    def check(self) -> None:
+        """Find the experiment, or make it."""
+        try:
+            self.client = self.mlflow.MlflowClient()
+            found = self.client.get_experiment_by_name(self.name)
+            self.experiment = self.client.create_experiment(self.name) if found is None else found.experiment_id
+        except Exception as error:
+            place = self.mlflow.get_tracking_uri()
+            raise UserError(
+                f"--mlflow {self.name}: {place} cannot be used: {in_words(error)}; the environment variable "
+                "MLFLOW_TRACKING_URI names a server or a database"
+            ) from error
+
     def open(self, started: events.Started) -> None:
+        self.check()
         known = started.run / "mlflow.txt"
         self.run = self._found(known) or self._made(name_of(started.run))
         replace_file(known, f"{self.run}\n".encode())

@@ -196,5 +196,5 @@ def nothing_known(discount: float) -> str:
     return (
         "the Q bias has nothing to compare with: no episode reached a terminal state, and of one that a time limit "
         f"cuts off the last {steps_before_a_cut(discount)} steps have no known return at discount {discount:g}: longer "
-        "episodes, a lower --discount or, to save the time, --q-bias-episodes 0"
+        "episodes, a lower discount or, to save the time, q_bias_episodes 0"
     )

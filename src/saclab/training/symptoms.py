@@ -34,7 +34,8 @@ def strange_temperature(settings: AlgorithmSettings, means: Means) -> str:
 def values_at_the_bound(settings: AlgorithmSettings, means: Means) -> str:
     """A categorical critic whose values come near the largest that it can represent."""
     value, bound = means["q_mean"], settings.critic_bound
-    if settings.critic_head != "categorical" or abs(value) < NEAR * bound:
+    within = settings.reward_scaling == "deviation_or_bound"  # the largest return lies at the bound then
+    if settings.critic_head != "categorical" or within or abs(value) < NEAR * bound:
         return ""
     scale = ", or scale rewards with --reward-scaling deviation_or_bound" if settings.reward_scaling == "none" else ""
     return (

@@ -26,6 +26,9 @@ def test_the_page_comes_again_from_them(tmp_path):
     page = write_report(find_runs([EXAMPLE / "runs"]), tmp_path)
     assert page.stat().st_size < 3e6
     assert "averaged-spacing-200" in page.read_text()
+    kept = EXAMPLE / "report"
+    assert (tmp_path / "scores.csv").read_text() == (kept / "scores.csv").read_text(), "saclab report makes it again"
+    assert len((kept / "index.html").read_text().splitlines()) == len(page.read_text().splitlines())
 
 
 @pytest.fixture(scope="module")

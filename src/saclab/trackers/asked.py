@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tracking:
+    """Where a run's numbers are sent while it goes on, besides its own logs: nowhere, unless it is said."""
+
     tensorboard: bool = False
     """Write TensorBoard event files into the run folder; needs the extra `tensorboard`."""
     wandb: str | None = None

@@ -97,8 +97,10 @@ def test_same_seed_twice_names_both(tmp_path):
     runs = [write_run(tmp_path / root, "sac", 7) for root in ("one", "two")]
     for allow_mixed in (False, True):
         with pytest.raises(UserError, match="same seed 7") as refused:
-            read_comparison(runs, allow_mixed)
+            read_comparison(runs, allow_mixed, strict=True)
         assert all(str(run) in str(refused.value) for run in runs)
+        (left_out,) = read_comparison(runs, allow_mixed).left_out
+        assert all(str(run) in left_out for run in runs)
 
 
 def test_unknown_variant_is_grouped_by_its_settings(tmp_path):

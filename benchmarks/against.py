@@ -4,8 +4,8 @@
     python benchmarks/against.py /tmp/before --rounds 5
 
 Both use the packages of this environment. Plain SAC at one update per five environment steps, in each place of the race
-(speed.py); what it finds is kept in benchmarks/results/against.json. A run beside which other processes took more than a
-tenth of a core is made again: a run on two cores falls to half its pace when one of them is taken.
+(speed.py); what it finds is kept in benchmarks/results/against.json. A run beside which other processes took more than
+a tenth of a core is made again: a run on two cores falls to half its pace when one of them is taken.
 """
 
 from __future__ import annotations

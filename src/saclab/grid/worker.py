@@ -20,7 +20,7 @@ from saclab.environments.watch import log
 from saclab.errors import RunBroken
 from saclab.exits import end_after
 from saclab.signals import die_with
-from saclab.trackers.asked import Tracking
+from saclab.trackers.asked import Tracking, trackers_of
 from saclab.training.lock import InUse, wait_until_free
 
 if TYPE_CHECKING:
@@ -93,8 +93,8 @@ def events(task: dict[str, Any], requests: Requests) -> Iterator[tuple[int, Even
     from saclab.trackers.feed import track_runs
 
     runs = [(Config.from_dict(run["config"]), Path(run["folder"])) for run in task["runs"]]
-    tracking = Tracking(**task["tracking"])
-    return track_runs(trained(task, runs, requests), [tracking.trackers(*run) for run in runs])
+    trackers = trackers_of(Tracking(**task["tracking"]), runs)
+    return track_runs(trained(task, runs, requests), trackers)
 
 
 def trained(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,3 +56,10 @@ VARIABLES = ("WANDB_", "MLFLOW_")
 """What the names of environment variables begin with by which a user tells trackers where to send to, and as whom."""
 WANDB_HERE = "WANDB_SERVICE"
 """The one that is about a process of this machine."""
+
+
+def trackers_of(tracking: Tracking, runs: Sequence[tuple[Config, Path]]) -> list[list[Tracker]]:
+    """For each run those that were asked for; none of one that is finished, of which nothing comes."""
+    from saclab.training.run_folder import is_finished
+
+    return [[] if is_finished(folder) else tracking.trackers(config, folder) for config, folder in runs]

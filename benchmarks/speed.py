@@ -61,7 +61,10 @@ class Place:
 PLACES = {
     "single run": Place(lambda cores: [cores], (*SACLAB, *PEERS)),
     "one core": Place(lambda cores: [cores[:1]], ("saclab", "Stable-Baselines3", "SBX", "RLtools")),
-    "grid": Place(lambda cores: [[core] for core in cores], ("saclab", "saclab, averaged", *PEERS)),
+    "grid": Place(
+        lambda cores: [[core] for core in cores],
+        ("saclab", "saclab, averaged", "Stable-Baselines3", "SBX", "RLtools"),
+    ),
 }
 
 

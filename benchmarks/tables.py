@@ -51,7 +51,8 @@ def peers_table(record: dict[str, Any]) -> str:
     ]
     raced = {name for rounds in cases for name in rounds[0]}
     for name in (BASE, *(name for name in PEER_ROWS if name in raced)):
-        rates = [row("", name, record["cases"][case]["rounds"])[2] for case in shown]
+        raced_here = [record["cases"][case]["rounds"] for case in shown]
+        rates = [row("", name, rounds)[2] if name in rounds[0] else "" for rounds in raced_here]
         ratios = sorted(saclab_faster_by(name, rounds) for rounds in cases if name in rounds[0])
         faster = "" if name == BASE else f"{ratios[0]:.2f} to {ratios[-1]:.2f}×"
         lines.append(f"| {name} | {rates[0]} | {rates[1]} | {faster} |")

@@ -58,6 +58,7 @@ benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other librarie
 
 benchmark-details: $(VENV)/installed  ## where the time and the memory go: leave the machine alone meanwhile
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
+	NPROC=1 OPENBLAS_NUM_THREADS=1 taskset -c 0 $(BIN)/python benchmarks/least.py HalfCheetah-v4
 	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/batches.py HalfCheetah-v4 --runs 1 4 16 --alone

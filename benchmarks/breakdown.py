@@ -4,9 +4,8 @@
 
 The parts of the loop are timed inside a real training under the paper's protocol, each without the parts that it
 calls; what none of them holds is "everything else", so the rows add up to the whole. Waiting for the update is the
-update's. Of an update, the matrix products are done once more: in one program, where each finds its operands cold and
-leaves its result in memory, and each again and again by itself, warm in the cache, which is the least they can take.
-XLA's own profiler slows an update by half, so it is not used here.
+update's. Of an update, the matrix products are done once more alone, in one program; XLA's own profiler slows an update
+by half, so it is not used here.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from keep import keep
-from operations import MatrixProduct, matrix_products
+from operations import matrix_products
 
 from saclab.environments.vector import TrainingEnvironments
 from saclab.protocols import make_config
@@ -160,28 +159,6 @@ def alternating(timed: dict[str, Callable[[], object]], calls: int, rounds: int 
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def warm_products(environment: str, variant: str, repeats: int = 30, rounds: int = 15) -> float:
-    """Milliseconds of the products of one update, each done many times in a row, with all it touches in the cache."""
-    config = make_config(environment, variant, "paper", overrides={"replay_capacity": 10_000})
-    engine = LocalEngine.new(config)
-    products = matrix_products(config.algorithm, engine.replay.layout)
-    engine.close()
-    return sum(warm_product(product, repeats, rounds) for product in products)
-
-
-def warm_product(product: MatrixProduct, repeats: int, rounds: int) -> float:
-    operands = [jnp.ones(shape) for shape in product.shapes]
-
-    def again(_: int, operands: list[jax.Array]) -> list[jax.Array]:
-        left, right = operands
-        result = product.multiply(left, right)
-        return [left.at[(0,) * left.ndim].set(1e-3 * result.ravel()[0]), right]  # so that none is done once for all
-
-    in_a_row = jax.jit(lambda operands: jax.lax.fori_loop(0, repeats, again, operands))
-    timed = {"products": lambda: jax.block_until_ready(in_a_row(operands))}
-    return alternating(timed, rounds, rounds)["products"] / repeats
-
-
 def show(title: str, parts: dict[str, float]) -> None:
     print(f"\n{title}")
     for part, milliseconds in sorted(parts.items(), key=lambda item: (item[0] == "whole", -item[1])):
@@ -200,12 +177,7 @@ def main() -> None:
     show(f"{what}: per update, with its 5 environment steps and their share of the evaluations", loop)
     update = update_breakdown(options.environment, options.variant, options.updates)
     show(f"{what}: one update", update)
-    warm = warm_products(options.environment, options.variant)
-    print(f"  {'(its products, each alone and warm)':<42}{warm:8.2f} ms {warm / update['whole']:6.0%}")
-    keep(
-        f"breakdown-{options.environment}-{options.variant}", loop_milliseconds=loop, update_milliseconds=update,
-        warm_products_milliseconds=warm,
-    )  # fmt: skip
+    keep(f"breakdown-{options.environment}-{options.variant}", loop_milliseconds=loop, update_milliseconds=update)
 
 
 if __name__ == "__main__":

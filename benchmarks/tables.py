@@ -27,9 +27,10 @@ def speed_table(record: dict[str, Any]) -> str:
     lines = [
         f"{machine['processor']}, {record['cores']} cores; {record['date'][:10]}; Python {versions['python']}, jax "
         f"{versions['jax']}, mujoco {versions['mujoco']}; {peers_of(record)}. Medians of "
-        f"{len(next(iter(record['cases'].values()))['rounds'])} alternating rounds (lowest and highest in brackets).",
+        f"{rounds_of(record)} alternating rounds, of ratios and shares within "
+        "a round (lowest and highest in brackets).",
         "",
-        "| case | | updates/s | share of the limit | saclab is faster by | CPU s per 1000 updates | first update, s "
+        "| case | | updates/s | share of the limit | saclab's rate / its | CPU s per 1000 updates | first update, s "
         "| peak, MiB |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -40,41 +41,52 @@ def speed_table(record: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def rounds_of(record: dict[str, Any]) -> str:
+    counts = sorted({len(entry["rounds"]) for entry in record["cases"].values()})
+    return " or ".join(map(str, counts))
+
+
 def peers_table(record: dict[str, Any]) -> str:
     """One row for each library: its rates in two cases, and how much faster saclab is, at least and at most."""
     cases = [entry["rounds"] for entry in record["cases"].values()]
     shown = ("HalfCheetah-v4, 1:5, single run", "HalfCheetah-v4, 1:5, grid")
     lines = [
         "| HalfCheetah-v4, an update every 5 steps | single run, updates/s | grid, updates/s "
-        f"| saclab is faster by, in up to {len(cases)} cases |",
+        f"| saclab's rate / its, in up to {len(cases)} cases, Humanoid-v4 and an update every step among them |",
         "|---|---|---|---|",
     ]
     raced = {name for rounds in cases for name in rounds[0]}
     for name in (BASE, *(name for name in PEER_ROWS if name in raced)):
         raced_here = [record["cases"][case]["rounds"] for case in shown]
         rates = [row("", name, rounds)[2] if name in rounds[0] else "" for rounds in raced_here]
-        ratios = sorted(saclab_faster_by(name, rounds) for rounds in cases if name in rounds[0])
+        ratios = sorted(statistics.median(ratios_to(name, rounds)) for rounds in cases if name in rounds[0])
         faster = "" if name == BASE else f"{ratios[0]:.2f} to {ratios[-1]:.2f}×"
         lines.append(f"| {name} | {rates[0]} | {rates[1]} | {faster} |")
     return "\n".join(lines)
 
 
-def saclab_faster_by(name: str, rounds: list[dict[str, Any]]) -> float:
-    """The median over the rounds of saclab's rate divided by that of `name` in the same round."""
-    return statistics.median(entry[BASE]["updates_per_second"] / entry[name]["updates_per_second"] for entry in rounds)
+def ratios_to(name: str, rounds: list[dict[str, Any]]) -> list[float]:
+    """The rate of saclab divided by that of `name` in the same round, for each round."""
+    return [entry[BASE]["updates_per_second"] / entry[name]["updates_per_second"] for entry in rounds]
+
+
+def with_spread(values: list[float], digits: int, unit: str = "") -> str:
+    """The median, the lowest and the highest."""
+    median, low, high = (f"{value:.{digits}f}" for value in (statistics.median(values), min(values), max(values)))
+    return f"{median}{unit} ({low}–{high})"
 
 
 def row(case: str, name: str, rounds: list[dict[str, Any]]) -> list[str]:
     rates = [entry[name]["updates_per_second"] for entry in rounds]
     limit = "averaged" if name.endswith("averaged") else "updates_per_second"
-    share = statistics.median(entry[name]["updates_per_second"] / entry["limit"][limit] for entry in rounds)
+    shares = [entry[name]["updates_per_second"] / entry["limit"][limit] for entry in rounds]
 
     def median(key: str) -> float:
         return statistics.median(entry[name][key] for entry in rounds)
 
     return [
-        case, name, f"{statistics.median(rates):.0f} ({min(rates):.0f}–{max(rates):.0f})", f"{share:.2f}",
-        "" if name == BASE else f"{saclab_faster_by(name, rounds):.2f}×",
+        case, name, with_spread(rates, 0), with_spread(shares, 2),
+        "" if name == BASE else with_spread(ratios_to(name, rounds), 2, "×"),
         f"{median('cpu_seconds_per_1000_updates'):.1f}",
         f"{median('first_update_seconds'):.1f}", f"{median('peak_bytes') / 2**20:.0f}",
     ]  # fmt: skip

@@ -249,7 +249,7 @@ def test_runs_are_spread_over_devices(tmp_path, devices):
     tests = str(Path(__file__).parents[1])
     subprocess.run(
         [sys.executable, "-c", DEVICES, tests, str(tmp_path / "many"), str(devices)],
-        check=True, env=environment_of() | flags, timeout=300,
+        check=True, env=environment_of() | flags, timeout=600,
     )  # fmt: skip
     train(tmp_path / "one", mixed())
     for run in range(3):

@@ -30,5 +30,5 @@ def test_curves_on_pendulum_agree(tmp_path):
         assert curves[:, :3].mean() < -400, "and was not at the start"
     difference = areas["alone"].mean() - areas["group"].mean()
     standard_error = np.sqrt(sum(area.var(ddof=1) / SEEDS for area in areas.values()))
-    assert abs(difference) < 3 * standard_error
+    assert abs(difference) < 4 * standard_error, "one draw in some thousands, if they learn alike"
     assert len({*areas["alone"], *areas["group"]}) == 2 * SEEDS, "they are not the same runs to the bit"

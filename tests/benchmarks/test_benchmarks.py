@@ -42,8 +42,8 @@ def test_a_row_holds_medians_and_ratios_within_rounds():
         {"saclab": result(ours), "SBX": result(theirs)} | LIMIT
         for ours, theirs in ((100.0, 50.0), (50.0, 10.0), (150.0, 50.0))
     ]
-    assert tables.row("case", "saclab", rounds)[:5] == ["case", "saclab", "100 (50–150)", "0.50", ""]
-    assert tables.row("", "SBX", rounds)[2:5] == ["50 (10–50)", "0.25", "3.00×"]
+    assert tables.row("case", "saclab", rounds)[:5] == ["case", "saclab", "100 (50–150)", "0.50 (0.25–0.75)", ""]
+    assert tables.row("", "SBX", rounds)[2:5] == ["50 (10–50)", "0.25 (0.05–0.25)", "3.00× (2.00–5.00)"]
 
 
 def test_a_table_takes_its_place_and_nothing_else():

@@ -22,6 +22,7 @@ FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no chromium, chromium-browser or google-chrome in PATH to open the report with"
 )
+expect.set_options(timeout=60_000)  # a slow machine takes longer than the five seconds it has by itself
 
 VARIANTS = ("sac", "averaged", "averaged-auto")
 HACK = "</script><script>hacked=1</script><img src=x onerror=hacked=1>"
@@ -90,7 +91,7 @@ def visit(browser):
         context.on("weberror", lambda error: noise.append(str(error.error)))
         context.on("request", lambda request: requests.append(request.url))
         page = context.new_page()
-        page.set_default_timeout(10_000)
+        page.set_default_timeout(60_000)
         page.goto(path.as_uri())
         visits.append((context, noise, requests, path.as_uri()))
         return page

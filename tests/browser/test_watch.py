@@ -31,7 +31,7 @@ def test_a_newer_page_comes_by_itself_and_keeps_the_choices(browser, served, tmp
     noise: list[str] = []
     context.on("console", lambda message: noise.append(message.text))
     page = context.new_page()
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(60_000)
     page.goto(served)
     expect(page.locator(".lead")).to_contain_text("2 runs")
     control(page, "Averaged-SAC").uncheck()

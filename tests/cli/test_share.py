@@ -221,7 +221,7 @@ print(saclab.load_policy("hf:user/swing").predict([1.0, 0.0, 0.5])[0][0])
 def test_load_policy_takes_an_address_and_offline_what_is_cached(workplace: Workplace, shared: Told) -> None:
     def loaded(**environment: str) -> float:
         process = subprocess.run(
-            [sys.executable, "-c", LOADED], env=os.environ | environment, capture_output=True, text=True, timeout=60
+            [sys.executable, "-c", LOADED], env=os.environ | environment, capture_output=True, text=True, timeout=600
         )
         assert process.returncode == 0, process.stderr
         return float(process.stdout)

@@ -26,7 +26,7 @@ def shell(line: str, folder: Path, **variables: str) -> subprocess.CompletedProc
     """A line of bash in which $saclab is the command."""
     saclab = f"{sys.executable} -m saclab"
     return subprocess.run(
-        ["bash", "-c", line], cwd=folder, capture_output=True, timeout=120,
+        ["bash", "-c", line], cwd=folder, capture_output=True, timeout=600,
         env={**os.environ, "saclab": saclab, **variables},
     )  # fmt: skip
 

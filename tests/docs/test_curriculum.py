@@ -31,7 +31,7 @@ def stages(tmp_path_factory):
         notes = folder / stage
         notes.mkdir()
         environment = os.environ | {"SACLAB": str(program), "NOTES": str(notes)}
-        subprocess.run([script, folder / "runs", stage], env=environment, check=True, timeout=100)
+        subprocess.run([script, folder / "runs", stage], env=environment, check=True, timeout=600)
         found[stage] = [named_config(path.read_text().splitlines()) for path in notes.iterdir()]
     return found
 
@@ -70,6 +70,6 @@ def test_an_arm_differs_from_its_baseline_in_the_schedule_alone(stages):
 
 def test_an_unknown_stage_is_told(tmp_path):
     script = ROOT / "examples/curriculum/run.sh"
-    told = subprocess.run([script, tmp_path / "runs", "ant"], capture_output=True, text=True, timeout=100)
+    told = subprocess.run([script, tmp_path / "runs", "ant"], capture_output=True, text=True, timeout=600)
     assert told.returncode == 2
     assert "unknown stage ant: use half-cheetah or humanoid" in told.stderr

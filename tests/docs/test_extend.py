@@ -59,7 +59,7 @@ def run(tree: Path, commands: str) -> str:
     path = os.pathsep.join([str(tree / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]])
     variables = {"PATH": path, "PYTHONPATH": str(tree / "src"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     done = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", commands], cwd=tree, env=os.environ | variables, timeout=300,
+        ["bash", "-euo", "pipefail", "-c", commands], cwd=tree, env=os.environ | variables, timeout=600,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     assert done.returncode == 0, f"{commands}\n{done.stdout}"

@@ -113,7 +113,7 @@ def test_code_is_left_as_it_is():
 def build(config: str, out: Path) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     command = [*BUILD, "--config-file", "-", "--site-dir", str(out)]
-    return subprocess.run(command, cwd=ROOT, env=environment, input=config, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, cwd=ROOT, env=environment, input=config, capture_output=True, text=True, timeout=600)
 
 
 @pytest.fixture(scope="module")

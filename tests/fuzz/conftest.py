@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 
 CHECKS = (HealthCheck.too_slow, HealthCheck.function_scoped_fixture, HealthCheck.data_too_large)
 settings.register_profile(
-    "fast", max_examples=50, derandomize=True, database=None, deadline=5000, suppress_health_check=CHECKS
+    "fast", max_examples=50, derandomize=True, database=None, deadline=None, suppress_health_check=CHECKS
 )
 settings.register_profile("slow", parent=settings.get_profile("fast"), max_examples=2000)
 settings.register_profile(

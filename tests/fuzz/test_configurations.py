@@ -28,7 +28,7 @@ from saclab.training import loop
 from saclab.training.events import Finished
 from saclab.training.local_engine import LocalBuilder
 
-SECONDS = 20  # for one line; a few hundredths, unless the machine is busy
+SECONDS = 120  # for one line; a few hundredths, unless the machine is busy
 SMALL = ("--random-steps", "300", "--batch-size", "8", "--hidden-layers", "4", "--replay-capacity", "1000",
          "--evaluation-episodes", "1", "--evaluation-interval-steps", "400", "--max-steps", "320")  # fmt: skip
 

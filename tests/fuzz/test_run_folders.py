@@ -110,7 +110,7 @@ def limited(seconds: int) -> Iterator[None]:
 
 
 def check(runs: Runs, name: str, found: list[Damage]) -> None:
-    with tempfile.TemporaryDirectory() as root, limited(20):
+    with tempfile.TemporaryDirectory() as root, limited(120):
         folder = Path(root) / "run"
         shutil.copytree(runs.folders[name], folder)
         for damage in found:

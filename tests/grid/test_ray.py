@@ -105,7 +105,7 @@ def kill_worker(cell: Cell, victim: Callable[[int], int]) -> None:
     worker = sessions(cell)[-1]["process"]
     os.kill(worker, signal.SIGSTOP)
     os.kill(victim(worker), signal.SIGKILL)
-    wait_for(lambda: is_dead(worker), seconds=1)
+    wait_for(lambda: is_dead(worker), seconds=30)
 
 
 def test_killed_processes_change_no_bit_of_a_grid(tmp_path, straight, capfd):
@@ -169,7 +169,7 @@ def test_a_grid_that_is_dropped_saves_and_leaves_no_process_behind(tmp_path):
     stream.close()
     assert all(map(is_dead, workers))
     assert all(checkpoint_steps(cell.folder)[0] > step for cell, step in zip(cells, seen, strict=True))
-    wait_for(lambda: all(map(is_dead, ray_processes)), seconds=20)
+    wait_for(lambda: all(map(is_dead, ray_processes)), seconds=120)
 
 
 def test_the_run_of_a_lost_machine_goes_on_at_another(tmp_path, straight):
@@ -204,7 +204,7 @@ def compare_on_ray(folder: Path) -> tuple[subprocess.Popen[str], list[int]]:
 def test_the_command_saves_on_a_signal_and_says_nothing_of_rays(tmp_path, straight, number):
     process, workers = compare_on_ray(tmp_path)
     process.send_signal(number)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=600)
     assert process.returncode == 128 + number, output
     assert output.count("interrupted") == 2
     assert output.splitlines()[-1] == "saved; the same command continues where it stopped"
@@ -217,8 +217,8 @@ def test_the_command_saves_on_a_signal_and_says_nothing_of_rays(tmp_path, straig
 def test_nothing_writes_on_once_the_command_is_killed(tmp_path, straight):
     process, workers = compare_on_ray(tmp_path)
     process.kill()
-    process.communicate(timeout=60)
-    wait_for(lambda: all(map(is_dead, workers)), seconds=60)
+    process.communicate(timeout=600)
+    wait_for(lambda: all(map(is_dead, workers)), seconds=180)
     run(tmp_path, *WORDS)
     assert_same_grid(grid(tmp_path / "runs"), straight)
 
@@ -229,7 +229,7 @@ def test_a_cluster_that_is_not_there_or_too_small_is_a_users_error(tmp_path):
         next(launch(grid(tmp_path), ray_pool(Cluster("127.0.0.1:1"), 1), Requests()))
     with pytest.raises(UserError, match="host:port"):
         next(launch(grid(tmp_path), ray_pool(Cluster("somewhere"), 1), Requests()))
+    assert time.monotonic() - began < 60
     with pytest.raises(UserError, match=r"1000 cores and 0 GPUs .*--ray-cpus"):
         next(launch(grid(tmp_path), ray_pool(Cluster("local", cpus=1000), 1), Requests()))
-    assert time.monotonic() - began < 60
     assert not list(tmp_path.iterdir())

@@ -54,7 +54,7 @@ def test_a_worker_dies_at_once_with_its_launcher():
     launcher.kill()
     launcher.wait()
     state = Path(f"/proc/{number}/stat")
-    wait_for(lambda: not state.exists() or ") Z" in state.read_text(), seconds=2)
+    wait_for(lambda: not state.exists() or ") Z" in state.read_text(), seconds=30)
 
 
 def test_a_worker_whose_launcher_is_gone_does_not_begin():

@@ -82,7 +82,7 @@ def test_strict_refuses_and_names_the_first(folders, tmp_path):
 def test_the_command_lists_what_is_left_out_and_strict_exits_with_2(folders, tmp_path):
     def report(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "saclab", "report", str(folders / "bert"), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=60)
+        return subprocess.run(command, capture_output=True, text=True, timeout=600)
 
     told = report(str(folders / "HalfCheetah-v4"), "--out", str(tmp_path / "report"))
     assert told.returncode == 0, told.stderr

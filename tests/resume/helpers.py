@@ -164,12 +164,12 @@ def kill(process: subprocess.Popen[str]) -> None:
 def run(folder: Path, *arguments: str, threads: int | None = 1) -> str:
     """The output of `saclab` with these arguments, once it has ended well."""
     process = start(folder, *arguments, threads=threads)
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     return output
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 120, every: float = 0.005) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 600, every: float = 0.005) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"

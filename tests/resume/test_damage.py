@@ -165,14 +165,14 @@ def test_of_two_resumes_at_once_exactly_one_trains(folder):
     for path in (folder / "checkpoints").iterdir():
         shutil.rmtree(path)  # the whole run is ahead: neither has finished before the other looks
     path = folder / "config.json"
-    path.write_text(path.read_text().replace('"max_steps": 150', '"max_steps": 6000'))
+    path.write_text(path.read_text().replace('"max_steps": 150', '"max_steps": 15000'))
     both = [start(folder.parent, "resume", folder.name) for _ in range(2)]
-    told = [process.communicate(timeout=200)[0] for process in both]
+    told = [process.communicate(timeout=600)[0] for process in both]
     codes = [process.returncode for process in both]
     assert sorted(codes) == [0, 2], told
     assert f"is in use by process {both[codes.index(0)].pid}: wait for it" in told[codes.index(2)]
     assert "Traceback" not in "".join(told)
-    assert read_run(folder).result["steps"] == 6000
+    assert read_run(folder).result["steps"] == 15000
     assert len((folder / "sessions.jsonl").read_text().splitlines()) == 3
 
 

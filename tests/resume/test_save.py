@@ -19,7 +19,7 @@ def test_death_at_any_system_call_of_a_save_leaves_a_whole_checkpoint():
     """The old one or the new one."""
     program = Path(__file__).with_name("kill_at_every_call.py")
     result = subprocess.run(
-        [sys.executable, str(program)], capture_output=True, text=True, timeout=120, env=environment_of(1)
+        [sys.executable, str(program)], capture_output=True, text=True, timeout=600, env=environment_of(1)
     )
     assert result.returncode == 0, result.stderr
     deaths = [json.loads(line) for line in result.stdout.splitlines()]

@@ -24,7 +24,7 @@ LONG = tuple(settings(
     max_steps=50_000_000, replay_capacity=2_000, evaluation_episodes=20, evaluation_interval_steps=50
 ))  # fmt: skip
 RUN = Path("runs/Pendulum-v1/sac-auto/standard/seed-0")
-WITHIN_SECONDS = 15  # one or two, unless the machine is busy
+WITHIN_SECONDS = 45  # one or two, unless the machine is busy or slow
 
 
 def started(folder: Path):
@@ -54,7 +54,7 @@ def test_usr1_saves_and_goes_on_and_term_saves_and_stops(tmp_path):
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
         process.send_signal(number)
         time.sleep(0.01)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=600)
     assert time.monotonic() - began < WITHIN_SECONDS
     assert process.returncode == 143, output
     assert f"saved; continue with: saclab resume {tmp_path / RUN}" in output
@@ -66,7 +66,7 @@ def test_int_saves_and_stops_with_its_own_status(tmp_path):
     process = started(tmp_path)
     began = time.monotonic()
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
+    process.communicate(timeout=600)
     assert time.monotonic() - began < WITHIN_SECONDS
     assert process.returncode == 130
     assert_whole(tmp_path)
@@ -76,7 +76,7 @@ def test_int_saves_and_stops_with_its_own_status(tmp_path):
 def test_a_closed_terminal_saves_and_stops_and_nohup_goes_on(tmp_path):
     process = started(tmp_path)
     process.send_signal(signal.SIGHUP)
-    process.communicate(timeout=60)
+    process.communicate(timeout=600)
     assert process.returncode == 129
     assert_whole(tmp_path)
     line = shlex.join(["nohup", *command("resume", str(RUN))])
@@ -137,7 +137,7 @@ def asleep_in_a_step(folder: Path, monkeypatch: pytest.MonkeyPatch, *arguments: 
 def ended_in_time(process, number: int) -> str:
     began = time.monotonic()
     process.send_signal(number)
-    output, _ = process.communicate(timeout=60)
+    output, _ = process.communicate(timeout=600)
     assert time.monotonic() - began < WITHIN_SECONDS, output
     assert process.returncode == 128 + number, output
     return output
@@ -161,9 +161,8 @@ def test_a_step_that_does_not_end_is_not_waited_for(tmp_path, monkeypatch, numbe
 def test_a_grid_does_not_wait_for_a_step_that_does_not_end(tmp_path, monkeypatch, more):
     process = asleep_in_a_step(tmp_path, monkeypatch, "compare", "--variants", "sac", "--seeds", "1", *more)
     assert "interrupted" in ended_in_time(process, signal.SIGTERM)
-    assert not [path for path in Path("/proc").glob("[0-9]*/environ") if says(path, str(tmp_path))], (
-        "no process is left"
-    )
+    # The environments' processes die with their worker, by the kernel: a moment after it.
+    wait_for(lambda: not [path for path in Path("/proc").glob("[0-9]*/environ") if says(path, str(tmp_path))], 60)
 
 
 def says(path: Path, text: str) -> bool:
@@ -202,7 +201,7 @@ with signals.requests_from_signals(process_ends=True) as requests:
     time.sleep(30)
 """
     began = time.monotonic()
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600)
     assert (ended.returncode, ended.stdout) == (143, "saved\n"), ended.stderr
     assert 2.4 < time.monotonic() - began < 25
 
@@ -213,16 +212,18 @@ import os, signal, time
 from saclab import signals
 signals.SECONDS_TO_OBEY = 0.3
 with signals.requests_from_signals(process_ends=True) as requests:
+    reader, writer = os.pipe()
     if (child := os.fork()) == 0:
-        time.sleep(0.5)
+        os.write(writer, b"ready")
+        time.sleep(60)
         os._exit(0)
-    time.sleep(0.1)
+    os.read(reader, 5)
     os.kill(child, signal.SIGTERM)
     os.waitpid(child, 0)
     time.sleep(1)
     print("alive")
 """
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600)
     assert (ended.returncode, ended.stdout) == (0, "alive\n"), ended.stderr
 
 

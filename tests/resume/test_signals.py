@@ -215,7 +215,7 @@ with signals.requests_from_signals(process_ends=True) as requests:
     reader, writer = os.pipe()
     if (child := os.fork()) == 0:
         os.write(writer, b"ready")
-        time.sleep(60)
+        time.sleep(1)
         os._exit(0)
     os.read(reader, 5)
     os.kill(child, signal.SIGTERM)

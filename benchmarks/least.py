@@ -19,9 +19,10 @@ from breakdown import alternating, update_breakdown
 from keep import keep
 from operations import MatrixProduct, matrix_products
 
-from saclab.config import Config
 from saclab.machine import usable_cores
 from saclab.protocols import make_config
+from saclab.replay import RowLayout
+from saclab.settings import AlgorithmSettings
 from saclab.training.local_engine import LocalEngine
 from saclab.training.process import prepare_process
 
@@ -41,21 +42,18 @@ def warm(work: Callable[..., jax.Array], first: jax.Array, *others: jax.Array) -
     return alternating(timed, ROUNDS, ROUNDS)["work"] / REPEATS
 
 
-def products(config: Config, engine: LocalEngine) -> float:
+def products(algorithm: AlgorithmSettings, layout: RowLayout) -> float:
     def one(product: MatrixProduct) -> float:
         return warm(product.multiply, *(jnp.ones(shape) for shape in product.shapes))
 
-    return sum(one(product) for product in matrix_products(config.algorithm, engine.replay.layout))
+    return sum(map(one, matrix_products(algorithm, layout)))
 
 
-def activations(config: Config) -> float:
+def activations(algorithm: AlgorithmSettings) -> float:
     """Bias and ReLU of each hidden layer's passes, the masks and the sums over the batch of the way back."""
-    algorithm = config.algorithm
     batch, layers = algorithm.batch_size, len(algorithm.hidden_layers)
     hidden, bias = jnp.ones((batch, algorithm.hidden_layers[0])), jnp.ones(algorithm.hidden_layers[0])
-    forward = layers * (
-        2 + 3 * algorithm.critics
-    )  # the policy at both states; targets, critics, critics for the policy
+    forward = layers * (2 + 3 * algorithm.critics)  # the policy at s and s′; targets, critics, those for the policy
     back = layers * (1 + 2 * algorithm.critics)
     learned = layers * (1 + algorithm.critics)
     return (
@@ -75,10 +73,11 @@ def adam(weights: jax.Array) -> float:
     return warm(step, weights)
 
 
-def noise(config: Config, action_size: int) -> float:
+def noise(*shape: int) -> float:
+    """Of the actions at s and at s′."""
+
     def draw(key: jax.Array) -> jax.Array:
         one, two = jax.random.split(key)
-        shape = (config.algorithm.batch_size, action_size)
         return jax.random.normal(one, shape) + jax.random.normal(two, shape)
 
     return warm(draw, jax.random.key_data(jax.random.key(0)))
@@ -91,14 +90,14 @@ def main() -> None:
     prepare_process()
     config = make_config(options.environment, "sac", "paper", overrides={"replay_capacity": 10_000})
     engine = LocalEngine.new(config)
-    layout = engine.replay.layout
+    algorithm, layout = config.algorithm, engine.replay.layout
     policy, critics = engine.learner_state.actor.weights, engine.learner_state.critic.weights
     parts = {
-        "matrix products": products(config, engine),
-        "activations, masks, gradients of biases": activations(config),
+        "matrix products": products(algorithm, layout),
+        "activations, masks, gradients of biases": activations(algorithm),
         "Adam, policy and critics": adam(policy) + adam(critics.ravel()),
         "Polyak averaging": warm(lambda targets: targets + 0.005 * (critics - targets), critics + 1),
-        "random numbers": noise(config, layout.action_size),
+        "random numbers": noise(algorithm.batch_size, layout.action_size),
     }
     engine.close()
     update = update_breakdown(options.environment, "sac", 400)
@@ -107,11 +106,8 @@ def main() -> None:
     for part, milliseconds in parts.items():
         print(f"  {part:<42}{milliseconds:8.2f} ms {milliseconds / update['whole']:6.0%}")
     print(f"  {'an update':<42}{update['whole']:8.2f} ms")
-    keep(
-        f"least-{options.environment}-{len(usable_cores())}-core",
-        milliseconds=parts,
-        update_milliseconds=update["whole"],
-    )
+    name = f"least-{options.environment}-{len(usable_cores())}-core"
+    keep(name, milliseconds=parts, update_milliseconds=update["whole"])
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pytest
 
 from saclab.report.runs import read_comparison
 from saclab.report.scores import aggregate, common_horizon, score_environment
-from saclab.report.sentences import MORE_SEEDS, ONE_SEED, environment_sentences
+from saclab.report.sentences import MORE_SEEDS, ONE_SEED, aggregate_sentences, environment_sentences
 from saclab.report.text import number_text
 from saclab.variants import VARIANTS, Variant
 
@@ -159,6 +159,7 @@ def test_aggregate_normalises_each_environment(tmp_path):
     (pair,) = together.pairs
     assert pair.improvement.estimate == pytest.approx(0.5 / 9)
     assert np.isfinite(pair.improvement.low)
+    assert aggregate_sentences(together)[0].endswith(", 3 seeds or more in each environment.")
     assert aggregate([score_environment(comparison, "Humanoid-v4")]) is None
 
 

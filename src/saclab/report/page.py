@@ -129,7 +129,8 @@ def together_section(together: AggregateScores | None) -> str:
         return ""
     return f"""<section id="together"><h2>All environments together</h2>
 <p>Final evaluation returns, normalised by environment: 0 is the lowest and 1 the highest of any run there. Such numbers
-hold within this report only. The probability of improvement is the mean over environments.</p>
+hold within this report only. The probability of improvement is the mean over environments; the seeds told with it are
+those of the environment with the fewest.</p>
 <div class="charts" data-environment="together" data-draw="intervals"></div>
 {pairs_html(together.pairs)}
 <h3>Share of runs above a score</h3><div class="charts" data-environment="together" data-draw="profile"></div>

@@ -60,26 +60,27 @@ def aggregate_sentences(together: AggregateScores) -> list[str]:
     """The summary of all environments together."""
     levels = "; ".join(f"{entry.arm.name} {interval_text(entry.interquartile_mean)}" for entry in together.arms)
     return [
-        *pair_sentences(together.pairs),
+        *pair_sentences(together.pairs, several_environments=True),
         f"Normalised final evaluation return: {levels.replace(' seeds', ' runs')}.",
     ]
 
 
-def pair_sentences(pairs: Sequence[Pair]) -> list[str]:
+def pair_sentences(pairs: Sequence[Pair], several_environments: bool = False) -> list[str]:
     """Decided pairs first, then undecided ones; those that no interval exists for in one sentence."""
+
+    def sentence(pair: Pair) -> str:
+        return pair_sentence(pair.x.name, pair.y.name, pair.improvement, several_environments)
+
     known = [pair for pair in pairs if pair.improvement.exists]
     decided = [pair for pair in known if pair.improvement.decided]
     undecided = [pair for pair in known if not pair.improvement.decided]
     runs = {pair.x: pair.improvement.runs_x for pair in pairs} | {pair.y: pair.improvement.runs_y for pair in pairs}
     many = len(runs) >= MANY_ARMS
-    if many:
-        sentences = winner_sentences(decided)
-    else:
-        sentences = [pair_sentence(pair.x.name, pair.y.name, pair.improvement) for pair in decided]
+    sentences = winner_sentences(decided) if many else [sentence(pair) for pair in decided]
     if many and len(undecided) > 1:
         sentences.append(undecided_sentence(undecided, len(known)))
     else:
-        sentences += [pair_sentence(pair.x.name, pair.y.name, pair.improvement) for pair in undecided]
+        sentences += [sentence(pair) for pair in undecided]
     alone = [arm.name for arm, count in runs.items() if count < 2]
     if alone and len(alone) == len(runs):
         return [ONE_SEED]
@@ -115,8 +116,11 @@ def undecided_sentence(pairs: Sequence[Pair], of: int) -> str:
     )
 
 
-def pair_sentence(x: str, y: str, improvement: Improvement) -> str:
-    """What the runs say about the variants named `x` and `y`, in one plain sentence."""
+def pair_sentence(x: str, y: str, improvement: Improvement, several_environments: bool = False) -> str:
+    """What the runs say about the variants named `x` and `y`, in one plain sentence.
+
+    Over several environments it tells the seeds of the one with the fewest, and the runs needed of all together.
+    """
     p, low, high, runs_x, runs_y, _ = improvement
     same = runs_x == runs_y
     seeds = f"{runs_x} seed{'s' * (runs_x != 1)}" if same else f"{runs_x} and {runs_y} seeds"
@@ -126,11 +130,12 @@ def pair_sentence(x: str, y: str, improvement: Improvement) -> str:
     if p < 0.5:
         x, y, p, low, high = y, x, 1 - p, 1 - high, 1 - low
         seeds = seeds if same else f"{runs_y} and {runs_x} seeds"
+    seeds += " or more in each environment" * several_environments
     if low > 0.5:
         return f"{x} beats {y}: P = {p:.2f} [{low:.2f}, {high:.2f}], {seeds}."
     needed = max(runs_needed(p), max(runs_x, runs_y) + 1)
     if needed > 1000:
         outlook = "even a thousand would not"
     else:
-        outlook = f"about {needed:.0f} would, if the difference is as it looks"
+        outlook = f"about {needed:.0f}{' in all' * several_environments} would, if the difference is as it looks"
     return f"{seeds} cannot tell {x} and {y} apart (P = {p:.2f} [{low:.2f}, {high:.2f}]); {outlook}."

@@ -10,7 +10,7 @@ import pytest
 from saclab.variants import VARIANTS
 
 PAGES = Path(__file__).parents[2] / "docs" / "variants"
-ROWS = [line for line in (PAGES / "README.md").read_text().splitlines() if line.startswith("| `")]
+ROWS = [line for line in (PAGES / "README.md").read_text().splitlines() if line.startswith("| `") and ".md)" in line]
 
 
 def page_of(variant: str) -> str:

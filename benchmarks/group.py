@@ -1,4 +1,4 @@
-"""Why runs as one group are slower on a CPU than one run alone: the same updates, their arrays laid out in four ways.
+"""What an update costs within a group of runs on a CPU: the same updates, their arrays laid out in four ways.
 
     python benchmarks/group.py HalfCheetah-v4 [--variant averaged] [--runs 16]
 
@@ -32,41 +32,50 @@ from saclab.training.local_engine import LocalEngine
 from saclab.training.process import compiled, prepare_process
 
 ROUNDS = 10
+STEP = np.int32(0)
+"""At which every part of a variant is updated."""
 Work = Callable[[], object]
+Given = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+"""Of a run: its plain numbers, rows f32[B, width], the weights and the scale of its rewards."""
 
 
 class Ways:
-    """Updates of as many runs as there are configs, on batches of ones."""
+    """Updates of as many runs as there are configs, each on a batch of its own."""
 
     def __init__(self, configs: list[Config], layout: RowLayout) -> None:
         self.runs = len(configs)
         self.learner = learner_of(structure(configs[0].algorithm), layout)
-        self.given = [jnp.asarray(numbers_of(config, layout)) for config in configs]
+        self.layout = layout
         self.states = [initial_learner(config, layout) for config in configs]
-        self.batch = layout.unpack(jnp.ones((configs[0].algorithm.batch_size, layout.width)))
-        self.context = Context(np.int32(0), jnp.ones(layout.reward_terms), jnp.float32(1))
+        rows = np.random.default_rng(0).random((self.runs, configs[0].algorithm.batch_size, layout.width), np.float32)
+        weights, scale = jnp.ones(layout.reward_terms), jnp.float32(1)
+        self.given = [
+            (jnp.asarray(numbers_of(config, layout)), jnp.asarray(own), weights, scale)
+            for config, own in zip(configs, rows, strict=True)
+        ]
 
-    def one(self, numbers: jax.Array, state: LearnerState) -> LearnerState:
-        return self.learner.update(unpack(numbers), state, self.batch, self.context)
+    def one(self, step: jax.Array, given: Given, state: LearnerState) -> LearnerState:
+        numbers, rows, weights, scale = given
+        return self.learner.update(unpack(numbers), state, self.layout.unpack(rows), Context(step, weights, scale))
 
     def separate(self, states: list[LearnerState]) -> Work:
         """Runs by turns, each with arrays of its own."""
-        states, turns, call = list(map(copied, states)), cycle(range(len(states))), compiled(self.one, donate_argnums=1)
+        states, turns, call = list(map(copied, states)), cycle(range(len(states))), compiled(self.one, donate_argnums=2)
 
         def work() -> None:
             run = next(turns)
-            states[run] = jax.block_until_ready(call(self.given[run], states[run]))
+            states[run] = jax.block_until_ready(call(STEP, self.given[run], states[run]))
 
         return work
 
-    def together(self, mapped: Callable[[jax.Array, LearnerState], LearnerState]) -> Work:
+    def together(self, mapped: Callable[[jax.Array, Given, LearnerState], LearnerState]) -> Work:
         """All runs in one call, each array one for all of them."""
-        numbers, state = stacked(self.given), stacked(self.states)
-        call = compiled(mapped, donate_argnums=1)
+        given, state = stacked(self.given), stacked(self.states)
+        call = compiled(mapped, donate_argnums=2)
 
         def work() -> None:
             nonlocal state
-            state = jax.block_until_ready(call(numbers, state))
+            state = jax.block_until_ready(call(STEP, given, state))
 
         return work
 
@@ -90,8 +99,8 @@ def products(config: Config, layout: RowLayout, runs: int) -> Work:
 def milliseconds(ways: Ways, config: Config, layout: RowLayout) -> dict[str, float]:
     """Of one run's update, by the way in which it is made."""
 
-    def in_turn(work: Callable[[jax.Array, LearnerState], LearnerState]) -> Callable[..., LearnerState]:
-        return lambda numbers, state: jax.lax.map(lambda each: work(*each), (numbers, state))
+    def in_turn(work: Callable[[jax.Array, Given, LearnerState], LearnerState]) -> Callable[..., LearnerState]:
+        return lambda step, given, state: jax.lax.map(lambda each: work(step, *each), (given, state))
 
     of_one: dict[str, Work] = {
         "alone": ways.separate(ways.states[:1]),
@@ -99,10 +108,10 @@ def milliseconds(ways: Ways, config: Config, layout: RowLayout) -> dict[str, flo
         "matrix products, alone": products(config, layout, 1),
     }
     of_all: dict[str, Work] = {
-        "side by side, arrays for all (what a group does)": ways.together(jax.vmap(ways.one)),
+        "side by side, arrays for all (what a group does)": ways.together(jax.vmap(ways.one, in_axes=(None, 0, 0))),
         "one after the other, arrays for all": ways.together(in_turn(ways.one)),
         "copying a run's part of arrays for all, out and back": ways.together(
-            in_turn(lambda _, state: jax.lax.optimization_barrier(state))
+            in_turn(lambda _step, _given, state: jax.lax.optimization_barrier(state))
         ),
         "matrix products, side by side": products(config, layout, ways.runs),
     }

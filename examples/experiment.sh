@@ -23,6 +23,10 @@ planned() {  # environment, number of seeds, protocol, settings of all arms
 # Carry out commands from standard input, two at a time, each on a core of its own. Stop it at any instant (Ctrl-C,
 # SIGTERM to the process group, a power cut): the same command goes on, and finished runs are skipped.
 train_two_at_a_time() {
+  if [[ $runs == *[[:space:]\"\'\\]* ]]; then
+    echo "the folder of the runs is $runs: use one without blanks, quotes and backslashes" >&2
+    return 2
+  fi
   give_way
   mkdir -p "$runs"
   xargs -r -P 2 -L 1 --process-slot-var=CORE \
@@ -36,6 +40,6 @@ give_way() {
     { echo 19 >/proc/self/autogroup; } 2>/dev/null || true
   fi
   if command -v ionice >/dev/null; then
-    ionice -c 3 -p $$ 2>/dev/null || true
+    ionice -c 3 -p "$BASHPID" 2>/dev/null || true
   fi
 }

@@ -1,9 +1,11 @@
-"""Means and deviations over seeds of the learning curves on HalfCheetah-v4 that the variants' authors have published.
+"""Means and deviations over seeds of learning curves on HalfCheetah-v4 that have been published as data.
 
-git clone https://github.com/dojeon-ai/SimbaV2 CLONES/SimbaV2    (those of SAC, REDQ, DroQ and CrossQ are there too)
-git clone https://github.com/danielpalenicek/xqc CLONES/xqc
-git clone https://github.com/Holiday-Robot/FlashSAC CLONES/FlashSAC
-python examples/family/published.py CLONES > examples/family/published.csv
+    git clone https://github.com/dojeon-ai/SimbaV2 CLONES/SimbaV2
+    git clone https://github.com/danielpalenicek/xqc CLONES/xqc
+    git clone https://github.com/Holiday-Robot/FlashSAC CLONES/FlashSAC
+    python examples/family/published.py CLONES > examples/family/published.csv
+
+Those of SAC, REDQ, DroQ and CrossQ are the baselines in the repository of SimbaV2.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import shlex
 import shutil
@@ -27,7 +28,7 @@ def commands_of(script: str, *words: str, folder: Path, keeping: bool = False) -
     if keeping:
         (experiment / "runs").symlink_to(EXAMPLES / script / "runs")
     told = folder / "saclab"
-    told.write_text('#!/usr/bin/env bash\nprintf "%q " "$@"\necho\n')
+    told.write_text('#!/usr/bin/env bash\nprintf "%s\\n" "${*@Q}"\n')  # one write: two of them share a log
     told.chmod(0o755)
     subprocess.run(
         [experiment / "run.sh", folder / "runs", *words], check=True, env=os.environ | {"SACLAB": str(told)}
@@ -55,6 +56,30 @@ def test_every_arm_is_started_for_every_seed_and_can_be(tmp_path, script, words,
     assert sorted((each.name, each.seed) for each in commands) == sorted(
         (arm, seed) for arm in arms for seed in range(seeds)
     )
+
+
+def test_the_family_is_evaluated_at_published_steps(tmp_path):
+    """Of each variant whose curve has a point that an hour reaches; episodes take 1000 steps, after the random ones."""
+    reached = set()
+    with (EXAMPLES / "family" / "published.csv").open() as file:
+        curve = [(row["variant"], int(row["steps"])) for row in csv.DictReader(file)]
+    for each in map(parse, commands_of("family", folder=tmp_path)):
+        config = make_config(
+            each.environment, each.variant, each.protocol, each.seed, overrides={**each.algorithm, **each.training}
+        )
+        training = config.training
+        last = training.random_steps + 1000 * training.max_episodes
+        steps = range(training.evaluation_interval_steps, last + 1, training.evaluation_interval_steps)
+        reached |= {variant for variant, at in curve if variant == each.variant and training.random_steps < at in steps}
+    assert reached == {"sac-auto", "redq", "droq", "crossq", "xqc"}
+
+
+def test_a_folder_that_xargs_would_take_apart_is_refused(tmp_path):
+    script, folder = EXAMPLES / "family" / "run.sh", tmp_path / "my runs"
+    done = subprocess.run([script, folder], check=False, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "use one without blanks, quotes and backslashes" in done.stderr
+    assert not folder.exists()
 
 
 def test_runs_that_are_kept_are_not_trained_again(tmp_path):

@@ -17,9 +17,13 @@ def test_ours_beside_the_published_returns(tmp_path):
         write_run(tmp_path, "xqc", seed, protocol="standard", returns=[100.0, 200.0, 300.0, 400.0, last])
     write_run(tmp_path, "tqc", protocol="standard", returns=[100.0, 4321.0])
     write_run(tmp_path, "flashsac", protocol="standard", returns=[100.0, 200.0, 300.0])
+    write_run(tmp_path, "crossq", protocol="standard", returns=[1000.0, 4000.0])
+    write_run(tmp_path, "redq", protocol="standard", evaluations=0, finished=False)
     table = subprocess.run([sys.executable, RESULTS, tmp_path], capture_output=True, text=True, check=True).stdout
     assert table.splitlines()[2:] == [
+        "| `crossq` | 10,000 | 1000 | 1148 ± 853, 10 seeds | -0.2 |",
+        "| `crossq` | 20,000 | 4000 | 3850 ± 946, 10 seeds | +0.2 |",
         "| `flashsac` | 30,000 | 300 | first at 100,000: 9815 ± 174 |  |",
-        "| `tqc` | 20,000 | 4321 | none found |  |",
+        "| `tqc` | 20,000 | 4321 | none |  |",
         "| `xqc` | 50,000 | 5000, 5310 | 6754 ± 1098, 10 seeds | -1.5 |",  # (5155.2 − 6753.7) / 1098.4
     ]

@@ -235,7 +235,7 @@ def test_sentences():
     assert "even a thousand would not" in pair_sentence("a", "b", improvement(0.5, 0.2, 0.8))
     several = pair_sentence("averaged", "sac", improvement(0.7, 0.4, 0.9, 2, 3), several_environments=True)
     assert several.startswith("2 and 3 seeds or more in each environment cannot tell averaged and sac apart (P = 0.70 ")
-    assert "about 33 in all would" in several
+    assert several.endswith("; more seeds might.")
     alone = pair_sentence("a", "b", improvement(1.0, math.nan, math.nan, 1, 1))
     assert "no interval exists" in alone
     assert "beats" not in alone

@@ -119,7 +119,7 @@ def undecided_sentence(pairs: Sequence[Pair], of: int) -> str:
 def pair_sentence(x: str, y: str, improvement: Improvement, several_environments: bool = False) -> str:
     """What the runs say about the variants named `x` and `y`, in one plain sentence.
 
-    Over several environments it tells the seeds of the one with the fewest, and the runs needed of all together.
+    Over several environments it tells the seeds of the one with the fewest, and not how many are needed.
     """
     p, low, high, runs_x, runs_y, _ = improvement
     same = runs_x == runs_y
@@ -134,8 +134,10 @@ def pair_sentence(x: str, y: str, improvement: Improvement, several_environments
     if low > 0.5:
         return f"{x} beats {y}: P = {p:.2f} [{low:.2f}, {high:.2f}], {seeds}."
     needed = max(runs_needed(p), max(runs_x, runs_y) + 1)
-    if needed > 1000:
+    if several_environments:
+        outlook = "more seeds might"
+    elif needed > 1000:
         outlook = "even a thousand would not"
     else:
-        outlook = f"about {needed:.0f}{' in all' * several_environments} would, if the difference is as it looks"
+        outlook = f"about {needed:.0f} would, if the difference is as it looks"
     return f"{seeds} cannot tell {x} and {y} apart (P = {p:.2f} [{low:.2f}, {high:.2f}]); {outlook}."

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Trains every variant of the family on HalfCheetah-v4 for as many environment steps as a core makes in about an hour, or
-# fewer where its published curve has a point before, two at a time, evaluated at that curve's steps; but for those whose results lie in examples/family/runs already.
-# Stop it at any instant: the same command goes on.
+# up to a point of its published curve near that, two at a time, evaluated at that curve's steps; but for those whose
+# results lie in examples/family/runs already. Stop it at any instant: the same command goes on.
 #
 #   examples/family/run.sh RUNS [SEEDS]
 #

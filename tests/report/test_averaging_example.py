@@ -40,6 +40,7 @@ def printed() -> str:
 
 def test_the_tables_of_the_page_are_those_that_the_command_prints(printed):
     assert "| `averaged` | 5 |" in printed
+    assert "| `averaged` | 3 |" in printed, "of Humanoid-v4"
     page = (ROOT / "docs" / "averaging.md").read_text()
     assert page.partition("<!-- results -->\n")[2].partition("\n<!-- end of results -->")[0] == printed
 

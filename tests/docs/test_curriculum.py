@@ -22,10 +22,12 @@ for word in "$@"; do printf '%s\\n' "$word"; done >"$NOTES/$$"
 def stages(tmp_path_factory):
     """Stage -> the name and the configuration of each run that the script would train, were none at hand."""
     folder = tmp_path_factory.mktemp("curriculum")
-    program, script = folder / "saclab", folder / "run.sh"
+    program, script = folder / "saclab", folder / "curriculum" / "run.sh"
+    script.parent.mkdir()
     program.write_text(NOTING)
     program.chmod(0o755)
     shutil.copy(ROOT / "examples/curriculum/run.sh", script)
+    shutil.copy(ROOT / "examples/experiment.sh", folder)
     found = {}
     for stage in ("half-cheetah", "humanoid"):
         notes = folder / stage

@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from saclab.cli.main import parse
-from saclab.protocols import make_config
+from ..experiments import commands_of, config_of
 
 ROOT = Path(__file__).parents[2]
-NOTING = """#!/bin/sh
-for word in "$@"; do printf '%s\\n' "$word"; done >"$NOTES/$$"
-"""
 
 
 @pytest.fixture(scope="module")
 def stages(tmp_path_factory):
     """Stage -> the name and the configuration of each run that the script would train, were none at hand."""
-    folder = tmp_path_factory.mktemp("curriculum")
-    program, script = folder / "saclab", folder / "curriculum" / "run.sh"
-    script.parent.mkdir()
-    program.write_text(NOTING)
-    program.chmod(0o755)
-    shutil.copy(ROOT / "examples/curriculum/run.sh", script)
-    shutil.copy(ROOT / "examples/experiment.sh", folder)
-    found = {}
-    for stage in ("half-cheetah", "humanoid"):
-        notes = folder / stage
-        notes.mkdir()
-        environment = os.environ | {"SACLAB": str(program), "NOTES": str(notes)}
-        subprocess.run([script, folder / "runs", stage], env=environment, check=True, timeout=600)
-        found[stage] = [named_config(path.read_text().splitlines()) for path in notes.iterdir()]
-    return found
-
-
-def named_config(words):
-    command = parse(words)
-    given = {**command.algorithm, **command.training}
-    config = make_config(command.environment, command.variant, command.protocol, command.seed, overrides=given)
-    return command.name, config
+    return {
+        stage: [
+            (command.name, config_of(command))
+            for command in commands_of("curriculum", stage, folder=tmp_path_factory.mktemp(stage))
+        ]
+        for stage in ("half-cheetah", "humanoid")
+    }
 
 
 def test_the_script_trains_the_seeds_and_arms_of_the_page(stages):

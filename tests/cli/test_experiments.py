@@ -6,8 +6,7 @@ import csv
 import subprocess
 
 import pytest
-
-from ..experiments import EXAMPLES, commands_of, config_of
+from experiments import EXAMPLES, commands_of, config_of
 
 HALF_CHEETAH = {"averaged", "averaged-spacing-200", "averaged-auto", "sac", "sac-lag", "averaged-entropy", "sac-auto"}
 HUMANOID = {"averaged", "averaged-auto", "sac", "sac-auto"}

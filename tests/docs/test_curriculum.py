@@ -6,8 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-
-from ..experiments import commands_of, config_of
+from experiments import commands_of, config_of
 
 ROOT = Path(__file__).parents[2]
 

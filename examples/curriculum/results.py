@@ -47,7 +47,16 @@ def main() -> None:
 
 
 def runs_of(comparison: Comparison, environment: str) -> Runs:
-    return {arm.name: comparison.groups[environment, arm] for arm in comparison.arms_of(environment)}
+    """Without a run that has just begun, and one caught between the writing of its two files."""
+    forward = FORWARD[environment]
+    return {
+        arm.name: tuple(
+            run
+            for run in comparison.groups[environment, arm]
+            if 0 < len(run.evaluations["steps"]) == len(run.reward_terms[forward])
+        )
+        for arm in comparison.arms_of(environment)
+    }
 
 
 def print_runs(runs: Runs, environment: str) -> None:

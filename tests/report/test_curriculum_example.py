@@ -23,7 +23,7 @@ def write_arm(root: Path, environment: str, name: str, seed: int, values: list[t
     scheduled = {} if name == "sac-auto" else {"reward_schedule": ("reward_ctrl: 1@0",)}
     folder = write_run(
         root, "sac-auto", seed, environment, overrides={"reward_terms": terms, **scheduled},
-        name=None if name == "sac-auto" else name, returns=[sum(pair) for pair in values],
+        name=None if name == "sac-auto" else name, returns=[sum(pair) for pair in values], finished=bool(values),
     )  # fmt: skip
     with (folder / "reward_terms.csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -60,3 +60,16 @@ def test_the_gate_asks_for_every_seed(tmp_path, late, verdict):
     table = printed(tmp_path)
     assert "| 0 | -90 against -50 | -20 against -50 | yes |" in table
     assert f"\nH1 {verdict}" in table
+
+
+def test_a_run_that_has_just_begun_is_left_out(tmp_path):
+    """Its first evaluation may be written while its terms are not."""
+    write_arm(tmp_path, "HalfCheetah-v4", "sac-auto", 0, [(100.0, -50.0)] * 20)
+    write_arm(tmp_path, "HalfCheetah-v4", "sac-auto", 1, [(100.0, -50.0)])
+    terms = next(tmp_path.rglob("seed-1/reward_terms.csv"))
+    terms.write_text(terms.read_text().splitlines(keepends=True)[0])
+    write_arm(tmp_path, "HalfCheetah-v4", "sac-auto", 2, [])
+    table = printed(tmp_path)
+    assert "| `sac-auto` | 0 |" in table
+    assert "| `sac-auto` | 1 |" not in table
+    assert "| `sac-auto` | 2 |" not in table

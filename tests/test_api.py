@@ -1,4 +1,4 @@
-"""What the functions of `saclab.api` share is the same in each.
+"""What the functions of `saclab.api` share is the same in each; what they refuse at once.
 
 A signature and a docstring that are read by type checkers, editors and `help` alike have to be written out; this holds
 them together.
@@ -12,6 +12,7 @@ import re
 import pytest
 
 from saclab import api
+from saclab.errors import UserError
 
 
 def arguments_of(function) -> dict[str, tuple[object, object, str]]:
@@ -32,3 +33,9 @@ def test_what_others_share_with_train_is_the_same(other, own):
     assert {name: ones[name] for name in shared} == {name: others[name] for name in shared}
     if own:
         assert ones.keys() ^ others.keys() == own
+
+
+def test_two_versions_of_an_environment_are_refused_at_once(tmp_path):
+    with pytest.raises(UserError, match="Hopper-v4 and Hopper-v5 are different tasks: compare them apart"):
+        api.compare(["Hopper-v4", "Hopper-v5"], ["sac"], 1, "quick", runs=tmp_path)
+    assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ import saclab
 
 HOUSE = Path(saclab.__file__).parent
 ROOMS = (
-    "errors", "extras", "files", "limits", "other_names", "reward_schedule", "refusals", "settings", "config",
+    "children", "errors", "extras", "files", "limits", "other_names", "reward_schedule", "refusals", "settings", "config",
     "variants", "protocols", "machine", "records", "hub", "algorithm", "environments", "replay", "memory",
     "trained_policy", "onnx_export", "training", "signals", "exits", "trackers", "batch", "grid", "report",
     "playback", "play", "sharing", "tuning", "api", "cli",

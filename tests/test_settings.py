@@ -83,6 +83,8 @@ def test_a_name_that_is_not_known_is_refused_with_those_that_are(setting):
             "use network: batch_norm_mlp starts in",
         ),
         ({"critic_head": "quantile", "entropy_window": 10}, "use 1 together with critic_head quantile"),
+        ({"critic_network": "batch_norm_mlp", "batch_size": 1}, "use at least 2 with batch_norm_mlp"),
+        ({"actor_interval": 5_000_000_000}, "use whole numbers of at most 2147483647"),
     ],
 )
 def test_critics_that_cannot_be_are_refused_with_the_way_out(settings, said):

@@ -15,17 +15,17 @@ from saclab.grid.resources import Resources, chosen_resources
 from saclab.grid.tasks import RunStatus
 from saclab.limits import require_minutes
 from saclab.protocols import make_config
-from saclab.report.runs import read_runs
+from saclab.report.runs import read_runs, two_versions
 from saclab.signals import requests_from_signals
 from saclab.trackers.asked import NOWHERE, Tracking
 from saclab.training.events import Event
-from saclab.training.lock import alone_in
 from saclab.training.requests import Requests
 from saclab.training.run_folder import RunRecord, read_config, read_run, run_path
 from saclab.variants import COMPARED
 
 Show = Callable[[Iterable[Sequence[RunStatus]]], list[RunStatus]]
 """What consumes the stream of a grid's statuses and returns the last ones."""
+TOLD_TO_STOP = "its worker was told to stop, not by this command; the same command goes on with it"
 Q_BIAS_EPISODES = 2
 """Episodes for the Q bias in `reproduce`: the paper's hypothesis is that averaging lowers it."""
 
@@ -150,9 +150,9 @@ class Comparison(NamedTuple):
     runs: list[RunRecord]
     """The runs that have begun and can be read, finished or not."""
     failed: dict[Path, str]
-    """Run folder -> what went wrong, or why it cannot be read."""
+    """Run folder -> what went wrong, or why it cannot be read; likewise the report's, if there could be none."""
     report: Path | None
-    """The report's page; None if no run has anything to show."""
+    """The report's page; None if no run has anything to show, or there could be none."""
     interrupted: int = 0
     """The signal that stopped the grid, or 0."""
 
@@ -224,6 +224,8 @@ def _compare(
     tracking: Tracking = NOWHERE,
 ) -> Comparison:
     require_minutes(checkpoint_minutes)
+    for reason in two_versions({cell.config.environment: None for cell in cells}):
+        raise UserError(f"{reason}: compare them apart, each with a --report of its own")
     for cell in [cell for cell in cells if not cell.finished][:1]:
         tracking.usable(*cell)  # said before anything is started; and MLflow's experiment is made by one process
     report = absolute(report)
@@ -264,8 +266,7 @@ def write_page(runs: Sequence[RunRecord], report: Path, tell: Callable[[str], No
 
     if not runs:
         return None
-    with alone_in(report):
-        return write_report([run.path for run in runs], report, tell=tell)
+    return write_report([run.path for run in runs], report, tell=tell)
 
 
 def compared(
@@ -274,7 +275,14 @@ def compared(
     """What came of a grid, with its report in a folder unless the grid was interrupted."""
     failed = {status.cell.folder: status.message for status in statuses if status.status == "failed"}
     runs, damaged = read_begun(statuses)
-    return Comparison(runs, damaged | failed, None if interrupted else write_page(runs, report, tell), interrupted)
+    if interrupted:
+        return Comparison(runs, damaged | failed, None, interrupted)
+    stopped = {status.cell.folder: TOLD_TO_STOP for status in statuses if status.status == "interrupted"}
+    try:
+        page, none = write_page(runs, report, tell), {}
+    except UserError as error:  # the runs are there, and what is said of them is worth more
+        page, none = None, {report: f"no report: {error}"}
+    return Comparison(runs, damaged | failed | stopped | none, page)
 
 
 def reproduce(

@@ -53,6 +53,13 @@ class Config:
             batch <= training.replay_capacity,
             "batch_size", batch, f"use at most replay_capacity {training.replay_capacity}",
         )  # fmt: skip
+        held = self.algorithm.n_step * training.parallel_environments
+        require(
+            held <= training.replay_capacity,
+            "replay_capacity", training.replay_capacity,
+            f"use at least {held}: n_step {self.algorithm.n_step} transitions of each of "
+            f"{training.parallel_environments} parallel_environments must be held together",
+        )  # fmt: skip
         require(
             self.algorithm.learning_rate_schedule == "constant" or self.planned_updates is not None,
             "learning_rate_schedule", self.algorithm.learning_rate_schedule,

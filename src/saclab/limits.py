@@ -16,8 +16,9 @@ MOST = {
     "q_bias_episodes": 100_000,
     "longest_noise": 10_000,
     "n_step": 1000,
+    "actor_interval": LARGEST_INDEX,
 }
-"""Setting -> its largest value, where each one more is made or gone through one by one."""
+"""Setting -> its largest value, where each one more is made or gone through one by one, or where it is compiled."""
 MOST_THREADS = 4096
 
 

@@ -76,7 +76,7 @@ def head_outputs(settings: AlgorithmSettings) -> int:
 WAYS_OUT = {
     "replay": "use --replay-capacity {fits} or less",
     "networks": "use smaller --hidden-layers, or fewer --critics or --snapshots",
-    "batch": "use a smaller --batch-size or --hidden-layers",
+    "batch": "use a smaller --batch-size, --hidden-layers, --critic-atoms, --n-step or --entropy-window",
 }
 
 

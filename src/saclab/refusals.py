@@ -82,7 +82,8 @@ def require_possible(settings: AlgorithmSettings) -> None:
     require(
         settings.critic_head == "scalar" or settings.entropy_window == 1,
         "entropy_window", settings.entropy_window,
-        f"use 1 together with critic_head {settings.critic_head}: it averages numbers, not distributions",
+        f"use 1 together with critic_head {settings.critic_head}: it is there to check the paper's numbers, those of "
+        "scalar critics",
     )  # fmt: skip
     names = settings.reward_terms
     require(len(set(names)) == len(names), "reward_terms", " ".join(names), "name each term once")
@@ -105,7 +106,13 @@ def require_possible(settings: AlgorithmSettings) -> None:
 
 
 def require_possible_layers(settings: AlgorithmSettings) -> None:
-    """Raise SettingError for layers that a network cannot have."""
+    """Raise SettingError for layers that a network cannot have, or that learn nothing from such batches."""
+    normalised = [name for name in (settings.network, settings.network_of_critic) if name.startswith("batch_")]
+    require(
+        not normalised or settings.batch_size >= 2,
+        "batch_size", settings.batch_size,
+        f"use at least 2 with {', '.join(normalised[:1])}: what is normalised over a batch of one is 0",
+    )  # fmt: skip
     for network, name in ((settings.network, "hidden_layers"), (settings.network_of_critic, "critic_hidden_layers")):
         layers = settings.hidden_layers if name == "hidden_layers" else settings.layers_of_critic
         require(

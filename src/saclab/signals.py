@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from types import FrameType
+from typing import IO
 
 from saclab.training.requests import Requests
 
@@ -26,6 +27,7 @@ LAST_WORDS = (
     "and the same command goes on from there\n"
 )
 SHOW_CURSOR = b"\x1b[?25h"  # a live display has hidden it
+LOG_END = 65536  # bytes
 PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
 
 
@@ -127,6 +129,12 @@ def die_with(parent: int) -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it was dead before this was asked for
         sys.exit(f"the process that started this one, {parent}, is gone")
+
+
+def end_of(log: IO[str]) -> str:
+    """The last lines of a log: that of a process whose environment prints at every step is long."""
+    log.seek(max(0, log.seek(0, os.SEEK_END) - LOG_END))
+    return log.read()
 
 
 def how_it_ended(code: int, errors: str) -> str:

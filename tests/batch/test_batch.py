@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from contextlib import closing
@@ -290,3 +291,15 @@ def test_a_folder_in_use_is_refused(tmp_path):
         next(first)
         with pytest.raises(UserError, match="in use by this process"):
             train(tmp_path, configs)
+
+
+def test_the_environments_of_a_group_are_closed(tmp_path, monkeypatch):
+    signed = tmp_path / "signed"
+    signed.mkdir()
+    with tiny_environments(monkeypatch) as prefix:
+        own = config(environment=f"{prefix}Signing-v0")
+        own = dataclasses.replace(own, environment_arguments={"folder": str(signed)})
+        with closing(engine_of([own, own], workers=2)):
+            before = {path.name.split("-")[1] for path in signed.iterdir()}
+        workers = {path.name.split("-")[1] for path in signed.iterdir()} - before - {str(os.getpid())}
+    assert len(workers) == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -123,6 +124,17 @@ class Fragile(Constant):
         self.count, self.doomed = int(state["counters"][0]), bool(state["counters"][1])
 
 
+class Signing(Constant):
+    """It leaves a file in a folder when it is closed."""
+
+    def __init__(self, folder: str, render_mode: str | None = None) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def close(self) -> None:
+        (Path(self.folder) / f"closed-{os.getpid()}-{id(self)}").touch()
+
+
 class Leaning(Constant):
     """One step long; going right and going left are two terms of a reward that is always 0."""
 
@@ -165,6 +177,8 @@ gymnasium.register("Counting-v0", Counting, max_episode_steps=TIME_LIMIT)
 gymnasium.register("CapturableCounting-v0", CapturableCounting, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Constant-v0", Constant, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Fragile-v0", Fragile, max_episode_steps=TIME_LIMIT)
+gymnasium.register("Signing-v0", Signing, max_episode_steps=TIME_LIMIT)
+gymnasium.register("Endless-v0", Constant)
 gymnasium.register("Leaning-v0", Leaning, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Reticent-v0", Reticent, max_episode_steps=TIME_LIMIT)
 gymnasium.register("Odd-v0", Odd)

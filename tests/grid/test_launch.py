@@ -131,6 +131,15 @@ def test_a_worker_that_dies_is_a_failed_run(tmp_path: Path, monkeypatch: pytest.
     assert statuses[0].message == "its worker ended (exit status 1: SystemExit: no python today)"
 
 
+def test_a_folder_that_cannot_be_made_stops_no_other_run(tmp_path: Path) -> None:
+    cells = grid(tmp_path)
+    cells[0].folder.parent.mkdir(parents=True)
+    cells[0].folder.write_text("in the way")
+    *_, statuses = launch(cells, local_pool(1, threads=1), Requests())
+    assert [status.status for status in statuses] == ["failed", "finished"]
+    assert statuses[0].message.startswith("cannot be started: ")
+
+
 def test_a_worker_that_is_killed_is_a_failed_run_on_this_machine(tmp_path: Path) -> None:
     cells = grid(tmp_path, max_updates=1_000_000)[:1]
     killed = False

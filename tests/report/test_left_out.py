@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -108,6 +109,19 @@ def test_a_comparison_reports_what_it_can_read_and_calls_the_rest_failed(tmp_pat
     assert [run.path for run in result.runs] == runs[:1]
     assert "evaluations.csv is damaged" in result.failed[runs[1]]
     assert result.report is not None
+
+
+def test_a_comparison_without_a_report_says_what_failed_all_the_same(tmp_path):
+    """A worker that was told to stop from outside is no success."""
+    cells = [Cell(read_config(run), run) for run in (write_run(tmp_path, seed=seed, evaluations=2) for seed in (0, 1))]
+    statuses = make_statuses(cells)
+    statuses[1].status = "interrupted"
+    (tmp_path / "file").write_text("")
+    result = compared(statuses, tmp_path / "file", 0)
+    assert (len(result.runs), result.report) == (2, None)
+    assert result.failed[tmp_path / "file"].startswith("no report: cannot write the report to ")
+    assert "the same command goes on" in result.failed[cells[1].folder]
+    assert compared(statuses, tmp_path / "report", signal.SIGINT).failed == {}
 
 
 @pytest.mark.parametrize("place", ["file", "file/report", "/proc/none"])

@@ -93,6 +93,19 @@ def test_allowed_mixed_runs_stand_apart_and_are_labelled(tmp_path):
     assert "snapshot_interval is 200" in comparison.mixed[0]
 
 
+@pytest.mark.parametrize("ends", [("a", "b"), (1.5, 1.25)])
+def test_long_values_that_begin_alike_make_two_arms(tmp_path, ends):
+    """Only their beginning is shown."""
+    runs = [write_run(tmp_path, seed=0)]
+    for seed, end in enumerate(ends, start=1):
+        long = {"environment_arguments": {"a_rather_long_argument": 0.125, "the_other_one": end}}
+        runs.append(write_run(tmp_path / str(seed), seed=seed, rename=long))
+    arms = read_comparison(runs, allow_mixed=True).arms
+    assert len(arms) == 3
+    assert len({arm.name for arm in arms}) == 3
+    assert all(len(arm.differs[0][1]) <= 30 for arm in arms[1:])
+
+
 def test_same_seed_twice_names_both(tmp_path):
     runs = [write_run(tmp_path / root, "sac", 7) for root in ("one", "two")]
     for allow_mixed in (False, True):

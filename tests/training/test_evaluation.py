@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import count
+
 import gymnasium
 import numpy as np
 import pytest
@@ -9,7 +11,9 @@ from environments import tiny
 
 from saclab.environments.make import environment_spec, make_environment
 from saclab.errors import NonFiniteError
+from saclab.training import evaluation
 from saclab.training.evaluation import Evaluator
+from saclab.training.requests import Stopped
 
 SEEDS = [11, 12, 13, 14]
 
@@ -89,3 +93,20 @@ def test_a_first_observation_that_is_not_finite_is_refused():
     gymnasium.register("First-v0", First, max_episode_steps=5)
     with pytest.raises(NonFiniteError, match=r"evaluation episodes \[0\]"):
         Evaluator("First-v0", {}).run(lambda observation: np.zeros((len(observation), 1), np.float32), [1])
+
+
+def test_an_episode_without_an_end_is_told_of_once(monkeypatch, caplog):
+    monkeypatch.setattr(evaluation, "LONG_EPISODE", 50)
+    steps = count(1)
+
+    def act(observation):
+        if next(steps) == 120:
+            raise Stopped
+        return np.zeros((len(observation), 1), np.float32)
+
+    with pytest.raises(Stopped):
+        Evaluator("Endless-v0", {}).run(act, SEEDS)
+    (told,) = caplog.messages
+    assert "of Endless-v0 has made 50 steps and goes on" in told
+    ended = Evaluator("Endless-v0", {"max_episode_steps": 7}).run(lambda seen: np.zeros((len(seen), 1)), SEEDS)
+    assert ended.lengths.tolist() == [7] * len(SEEDS), "what it advises"

@@ -39,6 +39,13 @@ def test_soft_returns_by_hand() -> None:
     np.testing.assert_allclose(returns, [2.825, 3.85, 4.0])
 
 
+def test_soft_returns_of_several_steps_hold_the_targets_entropy() -> None:
+    """With n = 2 that of every second action: of the others no target knows."""
+    # G_2 = 4;  G_1 = 2 + 0.5 * 4 = 4, two steps to the end;  G_0 = 1 + 0.5 * 2 + 0.25 (4 - 0.1 * 3) = 2.925
+    returns = known_returns(episode([1, 2, 4], [9, 2, 3], terminated=True), alpha=0.1, discount=0.5, n_step=2)
+    np.testing.assert_allclose(returns, [2.925, 4.0, 4.0])
+
+
 def test_the_entropy_of_the_first_action_is_not_part_of_its_own_q() -> None:
     changed = known_returns(episode([1, 2], [100, 2], terminated=True), alpha=0.1, discount=0.5)
     np.testing.assert_array_equal(changed, known_returns(episode([1, 2], [9, 2], True), alpha=0.1, discount=0.5))
@@ -68,7 +75,15 @@ def pendulum_bias(
     critic = np.array(state.critic.weights)
     critic[:critics_moved, -1] += shift  # the last parameter is the output's bias
     critics = Critics(
-        learner.policy, np.array(state.actor.weights), learner.q_values, critic, 0.2, discount, reduction, reward_scale
+        learner.policy,
+        np.array(state.actor.weights),
+        learner.q_values,
+        critic,
+        0.2,
+        discount,
+        1,
+        reduction,
+        reward_scale,
     )
     return measure_q_bias(critics, environment, [1, 2], np.random.default_rng(0))
 

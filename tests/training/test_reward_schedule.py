@@ -21,6 +21,7 @@ from saclab.training.local_engine import LocalBuilder, LocalEngine
 from saclab.training.logs import reward_term_columns
 from saclab.training.requests import Requests
 from saclab.training.run_folder import read_run
+from saclab.training.starts import early_end_notes
 
 CHEETAH = "HalfCheetah-v4"
 SLOPE = {"reward_schedule": ("reward_ctrl: 0@0.25 1@0.75",)}
@@ -222,3 +223,15 @@ def test_the_best_action_flips_with_the_weights_though_replay_is_old():
     first, last = leaning(reward_schedule=FLIP)
     assert first > 0.7
     assert last < -0.7
+
+
+def test_limits_that_may_cut_a_schedule_off_are_told_of():
+    (note,) = early_end_notes(make_config("Humanoid-v4", "curriculum", "paper"))
+    assert note.startswith("reward_schedule: over 1500000 planned updates")
+    assert note.endswith("without: --max-episodes None --patience-episodes None")
+    (note,) = early_end_notes(make_config(CHEETAH, "xqc", "standard", overrides={"max_episodes": 40}))
+    assert note.startswith("learning_rate_schedule: over 1990000 planned updates, before which max_episodes may")
+    by_return = {"reward_schedule": ("reward_linvel: 0.2@return=500 1@return=900",)}
+    assert early_end_notes(make_config("Humanoid-v4", "curriculum", "paper", overrides=by_return)) == []
+    assert early_end_notes(make_config("Humanoid-v4", "curriculum", "standard")) == []
+    assert early_end_notes(make_config(CHEETAH, "sac", "paper")) == []

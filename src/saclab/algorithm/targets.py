@@ -67,7 +67,7 @@ def averaged_prediction(
     Args:
         predictions: f32[K, C, B, n], each snapshot's critics on the same next states and actions.
         to_q: prediction f32[..., n] -> Q f32[...].
-        reduce: of REDUCTIONS or TARGET_REDUCTIONS.
+        reduce: of REDUCTIONS, or what one of TARGET_REDUCTIONS gives.
 
     Returns:
         The prediction f32[B, n], and the mean over the batch of the standard deviation between the snapshots' Q f32[].

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -25,7 +26,7 @@ from saclab.environments.vector import EndedEpisode
 from saclab.environments.watch import log
 from saclab.errors import NonFiniteError, RunBroken, TrainingFailed, UserError
 from saclab.replay import layout_of
-from saclab.signals import how_it_ended
+from saclab.signals import end_of, how_it_ended
 from saclab.training import seeds
 from saclab.training.captured import join_arrays, split_arrays
 from saclab.training.engine import EnvironmentStateError
@@ -33,6 +34,7 @@ from saclab.training.requests import Stopped
 from saclab.training.saved_state import EnvironmentState
 
 POLL_SECONDS = 0.1
+SECONDS_TO_CLOSE = 3.0  # all environments of a group
 
 
 class EnvironmentWorkerDied(TrainingFailed):
@@ -167,9 +169,12 @@ class EnvironmentPool:
         return restarted
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes, which close their environments."""
         for worker in self.workers:
-            worker.close()
+            worker.hang_up()
+        deadline = time.monotonic() + SECONDS_TO_CLOSE
+        for worker in self.workers:
+            worker.end(deadline)
         self.buffers.close()
 
     def _owners(self, run: int) -> list[PoolWorker]:
@@ -269,20 +274,26 @@ class PoolWorker:
             yield
         except (EOFError, BrokenPipeError) as error:
             code = self.process.wait()
-            self.errors.seek(0)
-            how = how_it_ended(code, self.errors.read())
+            how = how_it_ended(code, end_of(self.errors))
             raise EnvironmentWorkerDied(
                 f"the process that steps the environments of runs {sorted(set(self.runs.tolist()))} of the group ended "
                 f"with {how}. Nothing that was saved is lost: start the same command again to continue the group from "
                 "its last checkpoint"
             ) from error
 
-    def close(self) -> None:
+    def hang_up(self) -> None:
+        """Let it end by itself, once it has done what it is at."""
         with suppress(OSError):
             assert self.process.stdin is not None
             self.process.stdin.close()
-        self.process.terminate()
-        self.process.wait()
+
+    def end(self, deadline: float) -> None:
+        """Wait for its end until a moment of the monotonic clock, and no longer."""
+        try:
+            self.process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
         assert self.process.stdout is not None
         self.process.stdout.close()
         self.errors.close()

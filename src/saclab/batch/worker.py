@@ -160,6 +160,12 @@ class EnvironmentWorker:
         self.buffers.observation[share.rows] = share.environments.observation
         return {"restarted": restarted}, {}
 
+    def close(self) -> None:
+        """Close the environments; what goes wrong then harms no result."""
+        for share in self.shares:
+            share.environments.close()
+        self.evaluator.close()
+
     def _share(self, run: int) -> Share:
         return next(share for share in self.shares if share.run == run)
 
@@ -205,6 +211,7 @@ def answer_all(commands: int, answers: int) -> None:
                 send(answers, failures, arrays)
         else:
             send(answers, *worker.answer(*receive(commands)))
+    worker.close()
 
 
 if __name__ == "__main__":

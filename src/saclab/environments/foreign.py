@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from saclab.children import kept_from_children
 from saclab.environments.watch import Watch
 from saclab.errors import RunBroken, in_words, traceback_of
 
@@ -79,7 +80,8 @@ def prints_apart() -> Iterator[int]:
     own = os.dup(1)
     os.dup2(2, 1)
     try:
-        yield own
+        with kept_from_children(own):
+            yield own
     finally:
         sys.stdout.flush()
         os.dup2(own, 1)

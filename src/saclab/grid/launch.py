@@ -90,8 +90,13 @@ class Grid:
             self.waiting.remove(task)
             if all(run.status == "finished" for run in task.runs):
                 continue
+            try:
+                begun = self.pool.start(task)
+            except OSError as error:  # a folder that cannot be written to stops no other run
+                task.cannot_start(error)
+                continue
             self.running.append(task)
-            if self.pool.start(task):
+            if begun:
                 task.start()
 
     @property

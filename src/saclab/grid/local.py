@@ -69,7 +69,11 @@ class LocalPool:
     def start(self, task: Task) -> bool:
         cores = self.free_cores.pop(0) if self.free_cores else []  # none is left by those that hang
         told = task.to_dict(self.checkpoint_minutes, self.tracking, cores, self.environment_workers)
-        process = WorkerProcess(told, thread_limits(self.threads))
+        try:
+            process = WorkerProcess(told, thread_limits(self.threads))
+        except OSError:
+            self.free_cores.insert(0, cores)
+            raise
         self.workers[process.output.fileno()] = Worker(task, process, cores)
         self.selector.register(process.output, selectors.EVENT_READ)
         return True

@@ -138,6 +138,12 @@ class Task:
             for run in self.runs:
                 run.stalled = message["event"] == "stalled"
 
+    def cannot_start(self, error: OSError) -> None:
+        """Note that no process could be started for it."""
+        for run in self.runs:
+            if run.status != "finished":
+                run.status, run.message = "failed", f"cannot be started: {error}"
+
     def ended(self, code: int, stopping: bool, errors: str) -> None:
         """Note how the process ended; a worker that said nothing of a run's end has failed it.
 

@@ -14,6 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
+from saclab.signals import end_of
+
 
 class WorkerProcess:
     """A process that trains one task, out of reach of the terminal's Ctrl-C: its launcher tells it when to stop."""
@@ -64,12 +66,11 @@ class WorkerProcess:
         return [json.loads(line) for line in lines]
 
     def ended(self) -> tuple[int, str]:
-        """Exit status, and what it has written to its standard error, once it is silent."""
+        """Exit status, and the end of what it has written to its standard error, once it is silent."""
         code = self.process.wait()
         self.output.close()
-        self.log.seek(0)
         with self.log:
-            return code, self.log.read()
+            return code, end_of(self.log)
 
     def poll(self, seconds: float) -> dict[str, Any]:
         """All that a launcher on another machine asks for: the messages of the next seconds, and the end if it comes.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ from saclab.variants import VARIANTS
 ONLY_MEASURING = ("q_bias_episodes",)
 """Settings that change what is measured beside the training, and not its course."""
 
+SHORT_VALUE = 30
+"""Characters of a value that makes runs not comparable, in the name of an arm."""
 RATIO_SETTINGS = ("updates_per_interval", "update_interval")
 OWN = "the variant's own"
 """Stands for a value that no one has changed: variants are comparable though their rows say different ones. A value
@@ -207,6 +210,15 @@ def arm_of(
     return Arm(
         run.config.variant,
         name,
-        tuple((setting, shown(value, 30)) for setting, value in settings.items()),
-        tuple((shown(setting), shown(here, 30)) for setting, (here, _) in differences.items()),
+        tuple((setting, shown(value, 60)) for setting, value in settings.items()),
+        tuple((shown(setting), short_value(here)) for setting, (here, _) in differences.items()),
     )
+
+
+def short_value(value: Any) -> str:
+    """A value in a few characters; in place of what is cut off a digest of the whole, for it tells arms apart."""
+    whole = str(value)
+    if len(whole) <= SHORT_VALUE:
+        return shown(whole)
+    digest = hashlib.sha256(whole.encode(errors="surrogatepass")).hexdigest()[:6]
+    return f"{shown(whole, SHORT_VALUE - len(digest) - 1)} {digest}"

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
 from html import escape
 from importlib import resources
+from pathlib import Path
 from string import Template
 
 from saclab.records import Damaged, read_bytes
@@ -207,11 +209,10 @@ def videos(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str:
             run = best_recorded(comparison.groups[entry.environment, arm])
             if run is None:
                 continue
-            size = (run.path / "best" / "video.mp4").stat().st_size
-            content = None
+            content, size = None, run_video(run).stat().st_size
             if size <= VIDEO_BYTES and spent + size <= ALL_VIDEO_BYTES:
                 with suppress(Damaged):
-                    content = read_bytes(run.path / "best" / "video.mp4")
+                    content = read_bytes(run_video(run))
             spent += len(content or b"")
             figures.append(video_html(entry.environment, arm, run, size, content))
     if not figures:
@@ -221,8 +222,13 @@ def videos(comparison: Comparison, scores: Sequence[EnvironmentScores]) -> str:
 
 def best_recorded(runs: Sequence[RunRecord]) -> RunRecord | None:
     """The run with the highest evaluation return among those with a video."""
-    recorded = [run for run in runs if (run.path / "best" / "video.mp4").is_file() and best_return(run) is not None]
+    recorded = [run for run in runs if os.path.isfile(run_video(run)) and best_return(run) is not None]
     return max(recorded, key=lambda run: best_return(run) or 0.0, default=None)
+
+
+def run_video(run: RunRecord) -> Path:
+    """Where `record` films the best policy; `os.path.isfile` takes a folder that may not be looked into for none."""
+    return run.path / "best" / "video.mp4"
 
 
 def best_return(run: RunRecord) -> float | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from saclab.errors import UserError
+from saclab.files import replace_file
 from saclab.report.curves import Curves, gather_curves
 from saclab.report.figures import write_figures
 from saclab.report.notices import all_notices
@@ -15,6 +16,7 @@ from saclab.report.runs import Comparison, read_comparison
 from saclab.report.scores import AggregateScores, EnvironmentScores, aggregate, score_environment
 from saclab.report.sentences import summary_sentences
 from saclab.report.tables import latex, markdown, scores_csv
+from saclab.training.lock import alone_in
 
 
 class Compared(NamedTuple):
@@ -76,10 +78,10 @@ def write_report(
         "index.html": page_of(found),
     }
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        write_figures(found.comparison, found.scores, found.together, found.curves, out / "figures")
-        for name, text in texts.items():
-            (out / name).write_text(text, encoding="utf-8")
+        with alone_in(out):
+            write_figures(found.comparison, found.scores, found.together, found.curves, out / "figures")
+            for name, text in texts.items():
+                replace_file(out / name, text.encode())
     except OSError as error:
         raise UserError(
             f"cannot write the report to {out}: {error.strerror or error}; name another folder (--out; --report of "

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -197,17 +197,23 @@ def difference_sentence(run: RunRecord, reference: RunRecord, differences: Mappi
 
 def environment_differences(references: Mapping[str, RunRecord]) -> list[tuple[str, str]]:
     """Why the environments of a report cannot be summed up together: two versions of one, or two protocols."""
-    sentences: list[tuple[str, str]] = []
-    names, first = list(references), next(iter(references.values()))
-    for base, count in Counter(base_name(name) for name in names).items():
-        if count > 1:
-            versions = " and ".join(shown(name) for name in names if base_name(name) == base)
-            sentences.append((f"{versions} are different tasks", ""))
+    first = next(iter(references.values()))
+    sentences = [(sentence, "") for sentence in two_versions(references)]
     for run in references.values():
         if run.config.protocol != first.config.protocol:
             difference = {"protocol": (run.config.protocol, first.config.protocol)}
             sentences.append((difference_sentence(run, first, difference), ""))
     return sentences
+
+
+def two_versions(environments: Iterable[str]) -> list[str]:
+    """A sentence for each environment of which there are several versions."""
+    names = list(environments)
+    return [
+        f"{' and '.join(shown(name) for name in names if base_name(name) == base)} are different tasks"
+        for base, count in Counter(map(base_name, names)).items()
+        if count > 1
+    ]
 
 
 def base_name(environment: str) -> str:

@@ -13,6 +13,7 @@ from saclab.report.text import count_text, interval_text, number_text, shown
 
 MORE_SEEDS = "More seeds can change that: compare again with --seeds 5; finished runs are kept."
 ONE_SEED = f"One seed of each variant allows no conclusion about which is better. {MORE_SEEDS}"
+ONE_SEED_SOMEWHERE = f"One seed in an environment allows no conclusion over all of them. {MORE_SEEDS}"
 MANY_ARMS = 5
 """Number of arms from which on they are ranked, an arm that beats others takes one sentence, and so do all pairs that
 cannot be told apart."""
@@ -32,9 +33,9 @@ def environment_sentences(scores: EnvironmentScores) -> list[str]:
     if not evaluated:
         return ["No run has an evaluation so far, so there is nothing to compare."]
     sentences = pair_sentences(scores.pairs)
-    fewest, most = min(len(arm.runs) for arm in evaluated), max(len(arm.runs) for arm in evaluated)
-    sentences.append(levels_sentence(evaluated, one_seed=most == 1))
-    if 1 < fewest < FEW_RUNS:
+    seeds = [len(arm.runs) for arm in evaluated]
+    sentences.append(levels_sentence(evaluated, one_seed=max(seeds) == 1))
+    if any(1 < count < FEW_RUNS for count in seeds):
         sentences.append(
             f"With fewer than {FEW_RUNS} seeds the bootstrap intervals of returns are too narrow: read them as hints."
         )
@@ -83,7 +84,7 @@ def pair_sentences(pairs: Sequence[Pair], several_environments: bool = False) ->
         sentences += [sentence(pair) for pair in undecided]
     alone = [arm.name for arm, count in runs.items() if count < 2]
     if alone and len(alone) == len(runs):
-        return [ONE_SEED]
+        return [ONE_SEED_SOMEWHERE if several_environments else ONE_SEED]
     if alone:
         sentences.append(f"With one seed only, nothing can be said about {', '.join(alone)}. {MORE_SEEDS}")
     return sentences

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -43,7 +44,9 @@ class TensorBoard:
 
 
 class WeightsAndBiases:
-    """A run at Weights & Biases, under an id made of the run folder, so that a resumed run goes on there.
+    """A run at Weights & Biases, under an id that lies in the run folder, so that a resumed run goes on there.
+
+    It is the run's alone: one of the same path elsewhere, or trained anew, has another.
 
     The seeds of an arm are a group there.
     """
@@ -63,11 +66,12 @@ class WeightsAndBiases:
             raise UserError(f"--wandb {self.project}: not logged in; {LOGIN}")
 
     def open(self, started: events.Started) -> None:
-        name = name_of(self.folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        name, known = name_of(self.folder), started.run / "wandb.txt"
+        if not known.exists():
+            replace_file(known, f"{name}-{secrets.token_hex(4)}\n".encode())
         self.run = self.module.init(
-            project=self.project, name=name, id=name, group="-".join(self.folder.parts[-4:-1]), resume="allow",
-            config=self.config.to_dict(), dir=str(self.folder),
+            project=self.project, name=name, id=known.read_text().strip(), group="-".join(self.folder.parts[-4:-1]),
+            resume="allow", config=self.config.to_dict(), dir=str(self.folder),
             reinit="create_new",  # a run group has several at a time in one process
         )  # fmt: skip
 

@@ -21,6 +21,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -101,12 +102,13 @@ def save_checkpoint(folder: Path, moment: Moment, checkpoint: Checkpoint, replay
         sync(partial)
         partial.rename(final)
         sync(folder)
-        for old in newest_first(folder)[KEPT:]:
-            old.rename(old.with_suffix(".partial"))  # from now on it is no checkpoint, however far the removal gets
-        remove_all([*folder.glob("step-*.partial"), *folder.glob("step-*.damaged")])
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
         raise CheckpointError(cannot_save(final, error)) from error
+    with suppress(OSError):  # it is saved: what cannot be removed now is at the next save
+        for old in newest_first(folder)[KEPT:]:
+            old.rename(old.with_suffix(".partial"))  # from now on it is no checkpoint, however far the removal gets
+        remove_all([*folder.glob("step-*.partial"), *folder.glob("step-*.damaged")])
     return final
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,7 +11,15 @@ import numpy as np
 
 from saclab.environments.checked import CheckedEnvironment
 from saclab.environments.reward_terms import split_within_run
+from saclab.environments.watch import log
 from saclab.errors import NonFiniteError, RunBroken
+
+LONG_EPISODE = 100_000
+"""Steps of an evaluation episode after which it is told of: it may never end."""
+LONG_EPISODE_TOLD = (
+    "an evaluation episode of {name} has made {steps} steps and goes on: if it has no end, give it a "
+    """time limit, such as --environment-arguments '{{"max_episode_steps": 1000}}'"""
+)
 
 
 class EvaluationEpisodes(NamedTuple):
@@ -53,7 +62,11 @@ class Evaluator:
         term_returns = np.zeros((len(seeds), len(self.reward_terms) + 1))
         self._require_finite(observation, total_rewards)
         active = list(range(len(seeds)))
-        while active:
+        for step in itertools.count(1):
+            if not active:
+                break
+            if step == LONG_EPISODE:
+                log.warning(LONG_EPISODE_TOLD.format(name=self.name, steps=f"{LONG_EPISODE:,}"))
             actions = self.spec.scale_action(act(observation[active]))
             going_on = []
             for index, action in zip(active, actions, strict=True):

@@ -1,7 +1,4 @@
-"""Learners as training deals with them: compiled once, taken apart into named arrays, and put together again.
-
-Together with `batch/program.py` and the policies of `batch/worker.py` this is all that asks the algorithm room.
-"""
+"""Learners as training deals with them: compiled once, taken apart into named arrays, and put together again."""
 
 from __future__ import annotations
 

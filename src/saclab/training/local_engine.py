@@ -180,7 +180,7 @@ class LocalEngine:
         self, runs: Sequence[int], should_stop: Callable[[], bool] = never
     ) -> Mapping[int, QBias | RunBroken]:
         config, state = self.run.config, self.learner_state
-        if config.training.q_bias_episodes == 0:
+        if not runs or config.training.q_bias_episodes == 0:
             return {}
         critics = critics_of(
             config,

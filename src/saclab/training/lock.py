@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from saclab.children import kept_from_children
 from saclab.errors import UserError
 
 RETRY_SECONDS = 0.5
@@ -38,7 +39,8 @@ def locked(folder: Path) -> Iterator[None]:
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
-        yield
+        with kept_from_children(file.fileno()):
+            yield
 
 
 def taken(file: IO[str], kind: int, looks: int = 1) -> bool:
@@ -66,13 +68,10 @@ def alone_in(folder: Path) -> Iterator[None]:
     """Wait until no other process is in here with this folder; a file system that knows no locks lets all in.
 
     Raises:
-        UserError: if the folder cannot be made.
+        OSError: if the folder cannot be made.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror or error}; name another folder") from error
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)

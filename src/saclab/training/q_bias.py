@@ -3,8 +3,8 @@
 The measure of Chen et al. 2021 ("Randomized Ensembled Double Q-Learning", section 3): the normalised bias
 (Q(s, a) − G) / |mean of G|, its mean and its standard deviation over the state-action pairs of a few episodes of the
 policy. G is the soft return that SAC's Q stands for (Eq. 1, Eq. 4): the reward, then the discounted rewards and
-entropy bonuses that follow. The reward is the one that the critics learn from: its terms weighed as they are at that
-moment, and scaled.
+entropy bonuses that follow; of the latter those that the targets hold, with n_step each n-th one. The reward is the one
+that the critics learn from: its terms weighed as they are at that moment, and scaled.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ class Critics(NamedTuple):
     """f32[C, P]."""
     alpha: float
     discount: float
+    n_step: int
+    """Rewards in a target before the value: the entropy of the actions between is not part of it."""
     reduction: str
     """How the policy loss reduces the critics to one Q: the setting actor_reduction."""
     reward_scale: float = 1.0
@@ -96,7 +98,7 @@ def critics_of(
     settings = config.algorithm
     return Critics(
         learner.policy, actor, learner.q_values, critic, float(np.exp(np.asarray(log_alpha))), settings.discount,
-        settings.actor_reduction, reward_scale, settings.terms_of_reward, tuple(reward_weights),
+        settings.n_step, settings.actor_reduction, reward_scale, settings.terms_of_reward, tuple(reward_weights),
     )  # fmt: skip
 
 
@@ -126,7 +128,7 @@ def measure_q_bias(
     """
     episodes = [play(critics, environment, seed, generator, should_stop) for seed in episode_seeds]
     scaled = [episode._replace(reward=episode.reward / critics.reward_scale) for episode in episodes]
-    known = [known_returns(episode, critics.alpha, critics.discount) for episode in scaled]
+    known = [known_returns(episode, critics.alpha, critics.discount, critics.n_step) for episode in scaled]
     returns = np.concatenate(known)
     q = np.concatenate([
         critics.q(episode.observation[: len(part)], episode.action[: len(part)])
@@ -171,19 +173,25 @@ def play(
     return Episode(observations, actions, rewards, log_probs, terminated)
 
 
-def known_returns(episode: Episode, alpha: float, discount: float) -> np.ndarray:
-    """Soft returns f64[n] of the first n steps: G_t = r_t + γ (G_{t+1} − α log π(a_{t+1}|s_{t+1})).
+def known_returns(episode: Episode, alpha: float, discount: float, n_step: int = 1) -> np.ndarray:
+    """Soft returns of the first steps, f64[k]: G_t = Σ_{i<m} γⁱ r_{t+i} + γᵐ (G_{t+m} − α log π(a_{t+m}|s_{t+m})).
+
+    m is n_step, or what is left of the episode, as in the targets: with m of 1 every action's entropy counts, otherwise
+    that of each m-th one.
 
     All of an episode that ended in a terminal state are known. One that was cut off by a time limit says nothing of
     what would have followed, so only its steps count from where on that has a negligible weight.
     """
-    returns = np.zeros(len(episode.reward) + 1)
-    bonus = np.append(-alpha * episode.log_prob, 0.0)
-    for step in reversed(range(len(episode.reward))):
-        returns[step] = episode.reward[step] + discount * (returns[step + 1] + bonus[step + 1])
+    steps = len(episode.reward)
+    returns, bonus = np.zeros(steps + 1), np.append(-alpha * episode.log_prob, 0.0)
+    powers = discount ** np.arange(n_step + 1)
+    for step in reversed(range(steps)):
+        m = min(n_step, steps - step)
+        rewards = powers[:m] @ episode.reward[step : step + m]
+        returns[step] = rewards + powers[m] * (returns[step + m] + bonus[step + m])
     if episode.terminated:
         return returns[:-1]
-    return returns[: max(0, len(episode.reward) - steps_before_a_cut(discount))]
+    return returns[: max(0, steps - steps_before_a_cut(discount))]
 
 
 def steps_before_a_cut(discount: float) -> int:

@@ -49,7 +49,7 @@ def find_beginnings(builder: EngineBuilder, folders: Sequence[Path], facts: dict
     """
     layout, configs = builder.layout, builder.configs
     begun = [is_begun(folder, config) for folder, config in zip(folders, configs, strict=True)]
-    notes = [[ratio_note(config)] for config in configs]
+    notes = [[ratio_note(config), *early_end_notes(config)] for config in configs]
     found: list[Checkpoint] = []
     if any(begun):
         found = read_common([folder / "checkpoints" for folder in folders], builder.read, [own.append for own in notes])
@@ -145,6 +145,21 @@ def ratio_note(config: Config) -> str:
             "each time all of them have been stepped"
         )
     return note
+
+
+def early_end_notes(config: Config) -> list[str]:
+    """A schedule over the planned updates is cut off where a limit of another kind ends the run."""
+    training, by_share = config.training, [term for term in config.algorithm.scheduled_terms if not term.by_return]
+    schedules = ["learning_rate_schedule"] * (config.algorithm.learning_rate_schedule != "constant")
+    schedules += ["reward_schedule"] * bool(by_share)
+    limits = [name for name in ("max_episodes", "patience_episodes") if getattr(training, name) is not None]
+    if not schedules or not limits:
+        return []
+    flags = " ".join(f"--{name.replace('_', '-')} None" for name in limits)
+    return [
+        f"{' and '.join(schedules)}: over {config.planned_updates} planned updates, before which "
+        f"{' or '.join(limits)} may end the run; without: {flags}"
+    ]
 
 
 def require_same_config(folder: Path, config: Config) -> None:

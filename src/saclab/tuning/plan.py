@@ -165,7 +165,7 @@ def first_difference(mine: Mapping[str, Any], theirs: Any) -> tuple[str, Any, An
     """The first name whose value differs, with both values; inside of dictionaries, by both names."""
     theirs = theirs if isinstance(theirs, dict) else {}
     for name in (*mine, *theirs):
-        here, there = mine.get(name), theirs.get(name)
+        here, there = mine.get(name, "nothing"), theirs.get(name, "nothing")
         if here != there and isinstance(here, dict) and isinstance(there, dict):
             inner, here, there = first_difference(here, there)
             return f"{name}, {inner}", here, there

@@ -11,8 +11,8 @@ import saclab
 
 HOUSE = Path(saclab.__file__).parent
 ROOMS = (
-    "children", "errors", "extras", "files", "limits", "other_names", "reward_schedule", "refusals", "settings", "config",
-    "variants", "protocols", "machine", "records", "hub", "algorithm", "environments", "replay", "memory",
+    "children", "errors", "extras", "files", "limits", "other_names", "reward_schedule", "refusals", "settings",
+    "config", "variants", "protocols", "machine", "records", "hub", "algorithm", "environments", "replay", "memory",
     "trained_policy", "onnx_export", "training", "signals", "exits", "trackers", "batch", "grid", "report",
     "playback", "play", "sharing", "tuning", "api", "cli",
 )  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from saclab.config import Config
 from saclab.errors import UserError
-from saclab.files import absolute
+from saclab.files import absolute, make_folder
 from saclab.grid.launch import launch
 from saclab.grid.plan import Cell, make_grid
 from saclab.grid.resources import Resources, chosen_resources
@@ -229,6 +229,7 @@ def _compare(
     for cell in [cell for cell in cells if not cell.finished][:1]:
         tracking.usable(*cell)  # said before anything is started; and MLflow's experiment is made by one process
     report = absolute(report)
+    make_folder(cells[0].folder.parents[3], "--runs")  # said once, and not by each run
     if note := resources.note(cells):
         tell(note)
     with requests_from_signals() as requests:

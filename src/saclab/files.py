@@ -25,6 +25,15 @@ def absolute(path: Path | str) -> Path:
         raise UserError(f"{path}: the working directory does not exist any more: change to another one") from error
 
 
+def make_folder(folder: Path, option: str) -> None:
+    """Make a folder that may be there; raises UserError if that cannot be, with the option that names another."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"cannot write to {folder}: {reason}; name another folder with {option}") from error
+
+
 @contextmanager
 def same_directory() -> Iterator[None]:
     """Go back to this working directory at the end: an environment that was made for a look at it may have left it.

@@ -188,3 +188,14 @@ def test_many_arms_are_ranked_and_each_winner_takes_one_sentence(seven):
     )
     best = max(entry.arms, key=lambda arm: arm.final.estimate).arm.name
     assert levels.startswith(f"Final evaluation return (highest first): {best} ")
+
+
+def test_a_setting_that_another_row_has_already_is_given_to_both(tmp_path):
+    """As sac-auto whose terms are logged beside the curriculum, which names them itself."""
+    terms = {"reward_terms": ("reward_linvel", "reward_quadctrl", "reward_alive")}
+    plain = write_run(tmp_path, "sac-auto", environment="Humanoid-v4", overrides=terms)
+    other = write_run(tmp_path, "curriculum", environment="Humanoid-v4")
+    assert [arm.name for arm in read_comparison([plain, other]).arms] == ["sac-auto", "curriculum"]
+    third = write_run(tmp_path, "sac", environment="Humanoid-v4")
+    with pytest.raises(UserError, match="reward_terms is"):
+        read_comparison([plain, other, third])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -140,15 +140,26 @@ def is_known(config: Config) -> bool:
     return config.variant in VARIANTS and config.protocol in PROTOCOLS
 
 
-def unlike(run: RunRecord, reference: RunRecord) -> dict[str, tuple[Any, Any]]:
+def agreed_settings(runs: Sequence[RunRecord]) -> set[str]:
+    """Settings that some runs of one environment have been given, and that the rows of all others say too."""
+    plain = [run.config for run in runs if own_name(run) is None]
+    values = [asdict(config.algorithm) for config in plain]
+    given = {name for config in plain for name in beside_variant(config)}
+    return {name for name in given if all(each[name] == values[0][name] for each in values)}
+
+
+def unlike(run: RunRecord, reference: RunRecord, agreed: Container[str] = ()) -> dict[str, tuple[Any, Any]]:
     """Name -> (value here, value there), for what makes two runs of one environment not comparable.
 
     A run with a name of its own may have any settings of the algorithm; the others have their variant's, or those that
-    all have been given.
+    all have been given, or that are `agreed_settings`.
     """
     here, there = conditions(run), conditions(reference)
     if own_name(run) is None:
-        here, there = here | beside_variant(run.config), there | beside_variant(reference.config)
+        here, there = (
+            found | {name: value for name, value in beside_variant(config).items() if name not in agreed}
+            for found, config in ((here, run.config), (there, reference.config))
+        )
     found = {
         name: (value_shown(name, run, here, reference), value_shown(name, reference, there, run))
         for name in here | there

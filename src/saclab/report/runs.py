@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from saclab.errors import UserError
 from saclab.report.arms import (
     Arm,
+    agreed_settings,
     arm_of,
     beside_variant,
     conditions,
@@ -102,8 +103,10 @@ def group_runs(runs: Sequence[RunRecord], allow_mixed: bool = False) -> Comparis
         raise UserError("there is no run to compare")
     runs = sorted(runs, key=lambda run: (run.config.seed, str(run.path)))
     require_independent(runs)
-    references = {name: reference_run([run for run in runs if run.config.environment == name])
-                  for name in sorted({run.config.environment for run in runs})}  # fmt: skip
+    of_each = {name: [run for run in runs if run.config.environment == name]
+               for name in sorted({run.config.environment for run in runs})}  # fmt: skip
+    references = {name: reference_run(own) for name, own in of_each.items()}
+    agreed = {name: agreed_settings(own) for name, own in of_each.items()}
     refusals, common = environment_differences(references), given_to_all(runs)
     groups: dict[tuple[str, Arm], dict[int, RunRecord]] = {}
     firsts: dict[tuple[str | None, ...], RunRecord] = {}
@@ -111,7 +114,7 @@ def group_runs(runs: Sequence[RunRecord], allow_mixed: bool = False) -> Comparis
         environment, reference = run.config.environment, references[run.config.environment]
         first = firsts.setdefault(arm_key(run), run)
         inside = unlike_in_arm(run, first)
-        differences = unlike(run, reference) | inside
+        differences = unlike(run, reference, agreed[environment]) | inside
         arm = arm_of(run, first, differences, common)
         if differences and (environment, arm) not in groups:
             refusals.append(refusal(run, first if inside else reference, differences))

@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 
 PEERS := .venv-peers
 SUITES := .venv-suites
+RACE := benchmarks/results/own-speed.json
 WHEEL := .venv-wheel
 
 LINTED := src tests benchmarks examples docs/site_hooks.py
@@ -52,14 +53,14 @@ types: $(VENV)/installed
 	$(BIN)/mypy
 
 benchmark: $(VENV)/installed $(PEERS)/installed  ## speed against other libraries: leave the machine alone meanwhile
-	$(BIN)/python benchmarks/speed.py --peers $(PEERS)/bin/python
-	$(BIN)/python benchmarks/tables.py speed
-	$(BIN)/python benchmarks/tables.py peers
+	$(BIN)/python benchmarks/speed.py --peers $(PEERS)/bin/python --results $(RACE)
+	$(BIN)/python benchmarks/tables.py speed --results $(RACE)
+	$(BIN)/python benchmarks/tables.py peers --results $(RACE)
 
 benchmark-details: $(VENV)/installed  ## where the time and the memory go: leave the machine alone meanwhile
-	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
+	NPROC=1 OPENBLAS_NUM_THREADS=1 taskset -c 0 $(BIN)/python benchmarks/breakdown.py HalfCheetah-v4
 	NPROC=1 OPENBLAS_NUM_THREADS=1 taskset -c 0 $(BIN)/python benchmarks/least.py HalfCheetah-v4
-	NPROC=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/growth.py
+	NPROC=1 OPENBLAS_NUM_THREADS=1 taskset -c 0 $(BIN)/python benchmarks/growth.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/batches.py HalfCheetah-v4 --runs 1 4 16 --alone
 

@@ -3,10 +3,10 @@
     python benchmarks/speed.py --peers .venv-peers/bin/python [--rounds 3] [--only TEXT]
 
 End to end: environment, replay, acting, updates, logging, evaluations and the best policy's file; each library by its
-own loop, evaluations side by side in all of them. Plain SAC with Table 1 of the paper. Every round runs all contestants
-of a case one after the other, so a ratio compares neighbours in time; medians over rounds are reported. Imports,
-compilation and the first updates are outside the rate and shown as the seconds from the start of the process to the
-first update.
+own loop, evaluations side by side in all of them, but for RLtools (contestants/rltools_run.py says what it leaves out).
+Plain SAC with Table 1 of the paper. Every round runs all contestants of a case one after the other, so a ratio compares
+neighbours in time; medians over rounds are reported. Imports, compilation and the first updates are outside the rate
+and shown as the seconds from the start of the process to the first update.
 
 A case is a single run that may use all cores, a single run on one core, or a grid: as many runs at once as there are
 cores, one core each, whose rates are added. What each is compared with in the end is the machine: the time that the

@@ -140,11 +140,11 @@ def replace_between(text: str, name: str, table: str) -> str:
     return f"{before}{start}\n{table}\n{end}{after}"
 
 
-def made(name: str) -> str:
-    """A table by its name."""
+def made(name: str, results: Path = RESULTS / "speed.json") -> str:
+    """A table by its name; those of the race from its results."""
     if name == "batches":
         return batches_tables()
-    record = json.loads((RESULTS / "speed.json").read_text())
+    record = json.loads(results.read_text())
     return speed_table(record) if name == "speed" else peers_table(record)
 
 
@@ -152,8 +152,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=("speed", "peers", "batches"))
     parser.add_argument("--write", type=Path, help="the file to put the table into; printed otherwise")
+    parser.add_argument("--results", type=Path, default=RESULTS / "speed.json", help="of the race")
     options = parser.parse_args()
-    table = made(options.name)
+    table = made(options.name, options.results)
     if options.write is None:
         print(table)
         return

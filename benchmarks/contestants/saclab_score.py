@@ -16,15 +16,15 @@ def main() -> None:
     watch, settings = ScoreWatch(job), dict(job.settings)
     variant, protocol = str(settings.pop("variant")), str(settings.pop("protocol"))
     settings |= {
-        "max_steps": job.most_steps,
-        "max_updates": None,
         "evaluation_interval_steps": job.evaluation_interval_steps,
         "evaluation_episodes": job.evaluation_episodes,
     }
     config = make_config(job.environment, variant, protocol, job.seed, overrides=settings)
     for event in train(config, Path(job.folder) / "run"):
-        if isinstance(event, Evaluated) and watch.evaluated(event.steps, float(event.total_rewards.mean())):
-            break
+        if not isinstance(event, Evaluated):
+            continue
+        if watch.evaluated(event.steps, float(event.total_rewards.mean())) or event.steps >= job.most_steps:
+            break  # the protocol's own end stays, and with it the schedules of learning rates
     watch.report()
 
 

@@ -125,3 +125,9 @@ def test_numbers_of_numpy_and_lists_are_taken_as_their_type_has_them():
         int,
         float,
     ]
+
+
+@pytest.mark.parametrize("changes", [{"parallel_environments": 600}, {"parallel_environments": 2, "n_step": 300}])
+def test_a_replay_buffer_holds_a_window_of_every_environment(changes):
+    with pytest.raises(SettingError, match="replay_capacity = 512: use at least 600: n_step"):
+        make_config("Pendulum-v1", "sac", "quick", overrides={"replay_capacity": 512, **changes})

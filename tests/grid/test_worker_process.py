@@ -13,6 +13,7 @@ import pytest
 from resume.helpers import wait_for
 
 from saclab.grid.worker_process import WorkerProcess
+from saclab.signals import end_of
 from saclab.training.lock import locked, wait_until_free
 
 CHILD = "import os, sys, time; sys.path[:0] = {path!r}; from saclab.signals import die_with; {then}"
@@ -84,3 +85,11 @@ def test_a_run_folder_that_is_in_use_is_waited_for(tmp_path):
     assert not waiter.is_alive()
     holder.join()
     assert (tmp_path / "lock").read_text() == str(os.getpid())
+
+
+def test_of_a_long_log_the_end_is_read(tmp_path):
+    with (tmp_path / "log").open("w+") as log:
+        log.write("ä" * 100_000 + "\nlast words\n")
+        end = end_of(log)
+    assert end.endswith("ä\nlast words\n")
+    assert len(end) < 70_000

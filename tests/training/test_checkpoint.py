@@ -246,3 +246,26 @@ def test_after_a_damaged_checkpoint_whole_ones_are_saved(tmp_path, file, steps):
         assert_is(loaded, read, step, replay)
         assert warnings == []
     assert [path.name[-2:] for path in newest_first(tmp_path)] == ["40", "35"]
+
+
+def test_what_cannot_be_removed_harms_no_checkpoint(tmp_path, monkeypatch):
+    """As a file on NFS that another process has open; the next save removes it."""
+    replay, refused = ReplayBuffer(CAPACITY, LAYOUT), [OSError(errno.EBUSY, "busy")]
+    for step in (1, 2):
+        fill(replay, 5)
+        save(tmp_path, step, replay)
+    real = checkpoints.remove_all
+
+    def busy(folders):
+        if list(folders) and refused:
+            raise refused.pop()
+        real(folders)
+
+    monkeypatch.setattr(checkpoints, "remove_all", busy)
+    fill(replay, 5)
+    save(tmp_path, 3, replay)
+    assert not refused
+    assert_loads(tmp_path, 3, replay)
+    monkeypatch.undo()
+    save(tmp_path, 4, replay)
+    assert len(list(tmp_path.iterdir())) == 2

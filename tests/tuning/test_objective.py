@@ -7,6 +7,7 @@ import pytest
 
 from saclab.errors import SettingError
 from saclab.tuning.objective import Objective, objective_of
+from saclab.tuning.plan import first_difference
 
 SLOW = {"mean_return": np.array([1.0, 2.0, 6.0]), "steps": np.array([10, 20, 30]), "seconds": np.array([1.0, 2.5, 4.0])}
 NEVER = {"mean_return": np.array([1.0, 1.0]), "steps": np.array([10, 20]), "seconds": np.array([2.0, 3.0])}
@@ -46,3 +47,8 @@ def test_a_way_to_a_score_is_at_least_what_was_spent():
 def test_an_objective_that_cannot_be_is_refused(name, score, message):
     with pytest.raises(SettingError, match=message):
         objective_of(name, score)
+
+
+def test_a_setting_that_is_none_on_one_side_only_is_a_difference():
+    assert first_difference({"a": 1, "b": None}, {"a": 1}) == ("b", None, "nothing")
+    assert first_difference({"a": {"c": 1}}, {"a": {"c": 1, "d": None}}) == ("a, d", "nothing", None)

@@ -7,8 +7,8 @@ Each contestant trains from the start of its process until the mean return of an
 5,000 environment steps, reaches the environment's highest score; start, evaluations, files and compilation (nothing is
 compiled before) are counted in. One core each, as many side by side as there are cores; seed by seed, contestants in
 turn. What is kept already is not run again, so the measurement can be stopped and go on; `--only` chooses
-contestants. A run that never gets there makes 200,000 steps: by the costs of docs/variants/README.md some twenty minutes
-of sac-auto on a core, four to six hours of tqc, xqc and droq.
+contestants. A run that never gets there makes 200,000 steps: by the costs of docs/variants/README.md some twenty
+minutes of sac-auto on a core, four to six hours of tqc, xqc and droq.
 """
 
 from __future__ import annotations

@@ -291,12 +291,15 @@
   });
   drawAll();
 
-  // A page that is served asks for a newer one, and keeps what its reader has chosen.
+  // A page that is served asks for a newer one, and keeps what its reader has chosen and has before their eyes.
   const version = document.documentElement.dataset.version;
   if (version) {
     const inputs = () => [...controls.querySelectorAll("input")].map((input) => [`${input.name}: ${input.parentNode.textContent}`, input]);
     const details = () => [...document.querySelectorAll("details")].map((node) => [node.querySelector("summary").textContent, node]);
+    const landmarks = () => [...document.querySelectorAll("h2, figure")];
+    const top = (node) => node.getBoundingClientRect().top;
     const kept = JSON.parse(sessionStorage.getItem("saclab") || "null");
+    history.scrollRestoration = "manual"; // what browsers do by themselves differs, and what is above may have grown
     if (kept) {
       for (const [name, input] of inputs()) {
         if (name in kept.checked && input.checked !== kept.checked[name]) {
@@ -305,13 +308,18 @@
         }
       }
       for (const [name, node] of details()) node.open = kept.open.includes(name);
-      scrollTo(0, kept.scroll);
+      const landmark = landmarks()[kept.landmark];
+      if (landmark) scrollBy(0, top(landmark) - kept.top);
     }
-    const keep = () => sessionStorage.setItem("saclab", JSON.stringify({
-      checked: Object.fromEntries(inputs().map(([name, input]) => [name, input.checked])),
-      open: details().filter(([, node]) => node.open).map(([name]) => name),
-      scroll: scrollY,
-    }));
+    const keep = () => {
+      const landmark = landmarks().findIndex((node) => node.getBoundingClientRect().bottom > 0);
+      sessionStorage.setItem("saclab", JSON.stringify({
+        checked: Object.fromEntries(inputs().map(([name, input]) => [name, input.checked])),
+        open: details().filter(([, node]) => node.open).map(([name]) => name),
+        landmark,
+        top: landmark < 0 ? 0 : top(landmarks()[landmark]),
+      }));
+    };
     setInterval(async () => {
       try {
         if (await (await fetch("version")).text() === version) return;

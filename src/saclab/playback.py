@@ -115,6 +115,7 @@ def record(
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")
     require_seed(seed)
+    require(steps >= 1, "steps", steps, "film at least one step")
     run, left_in = on_disk(run), left_in or for_tracebacks(run)
     policy, description = load_policy(run), read_description(run)
     given, video = video, absolute(video)

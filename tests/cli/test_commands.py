@@ -272,6 +272,7 @@ def test_a_run_folder_alone_cannot_make_saclab_import_a_package(trained: Path, t
         (("compare", "Pendulum-v1", "--seeds", "0"), "seeds = 0"),
         (("evaluate", "nowhere", "--seed", "-1"), "seed = -1"),
         (("record", "nowhere", "--seed", "-1"), "seed = -1"),
+        (("record", "nowhere", "--steps", "0"), "steps = 0"),
         (("play", "nowhere"), "there is no folder "),
         (("play", "nowhere", "--episodes", "0"), "episodes = 0"),
         (("train", "Pendulum-v1", "--name", "x" * 300), "use at most 200 letters"),

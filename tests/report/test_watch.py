@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import http.client
+import socket
+import struct
 import threading
 
 import pytest
@@ -84,6 +86,30 @@ def test_other_methods_change_nothing(ask):
     assert ask("/", method="HEAD") == (200, "")
     assert ask("/", method="POST")[0] == 501
     assert ask("/", method="DELETE")[0] == 501
+
+
+def test_a_browser_that_goes_away_leaves_no_traceback(tmp_path, monkeypatch, capfd):
+    asked, gone = threading.Event(), threading.Event()
+
+    def page_when_gone(self) -> tuple[str, str]:
+        asked.set()
+        assert gone.wait(60)
+        return "x" * 50_000_000, "version"
+
+    monkeypatch.setattr(WatchedPage, "current", page_when_gone)
+    with server_of(WatchedPage([tmp_path], 1), 0) as server:
+        server.daemon_threads = False  # so that closing it waits for the answer
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        browser = socket.create_connection(("127.0.0.1", server.server_port))
+        browser.sendall(f"GET / HTTP/1.0\r\nHost: localhost:{server.server_port}\r\n\r\n".encode())
+        assert asked.wait(60)
+        browser.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        browser.close()
+        gone.set()
+        server.shutdown()
+        thread.join()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_port_in_use_is_named_with_the_way_out(tmp_path, capsys):

@@ -8,12 +8,14 @@ nothing.
 from __future__ import annotations
 
 import hashlib
+import sys
 import threading
 import time
 from collections.abc import Sequence
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 from saclab.errors import SettingError, UserError
 from saclab.report.report import compared, page_of
@@ -81,6 +83,13 @@ class WatchedPage:
         return "\n".join(found)
 
 
+class Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that goes away before its answer, as one does whose tab is closed, is no error."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 def server_of(watched: WatchedPage, port: int) -> ThreadingHTTPServer:
     """A server that answers on the loopback address; port 0 is any free one. Raises SettingError for one in use."""
 
@@ -115,7 +124,7 @@ def server_of(watched: WatchedPage, port: int) -> ThreadingHTTPServer:
             """Say nothing: the terminal shows where the page is."""
 
     try:
-        return ThreadingHTTPServer((LOOPBACK, port), Handler)
+        return Server((LOOPBACK, port), Handler)
     except (OSError, OverflowError) as error:
         raise SettingError("port", port, f"{error}; choose another with --port, or 0 for any that is free") from error
 

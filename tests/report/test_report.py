@@ -168,6 +168,13 @@ def test_svg_figures_are_well_formed_and_say_that_they_are_scaled_down(report):
         ElementTree.parse(path)
 
 
+@pytest.mark.parametrize("styles", [{}, {"sac": 0}, {"sac-alpha-tuning": 0}])
+def test_no_two_of_the_papers_curves_look_alike(styles):
+    handles = figures.draw_paper(figures.new_figure(1, 1).subplots(), "Humanoid-v4", styles)
+    assert len(handles) == 3
+    assert len({(line.get_color(), line.get_linestyle()) for line in handles.values()}) == 3
+
+
 def test_video_is_embedded_if_small(report, tmp_path):
     _, page = report
     assert sum(tag == "video" for tag, _ in page.elements) == 1

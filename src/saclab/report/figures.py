@@ -1,11 +1,12 @@
 """The figures of a report, as PNG and SVG: the paper's four panels, intervals, pairs, profiles, diagnostics.
 
 Colours are Okabe and Ito's, safe for the colour-blind; every arm also has a marker of its own, so that the figures can
-be read in grey. Dashed lines are the paper's own curves and nothing else.
+be read in grey. Broken lines are the paper's own curves and nothing else.
 """
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -159,13 +160,13 @@ def draw_arm(panel: Any, curves: ArmCurves, arm: Arm, axis: str, index: int, cro
 
 
 def draw_paper(panel: Any, environment: str, styles: dict[str, int]) -> dict[str, Any]:
-    """The paper's own curves of evaluation returns, dashed, in the colour of the variant of that name."""
-    handles = {}
+    """The paper's own curves of evaluation returns: dashed, in the colour of the variant of that name, or grey."""
+    handles, greys = {}, itertools.cycle(("--", ":", "-."))
     limit = panel.get_xlim()[1] if panel.lines else np.inf
     for name, curve in paper_curves(environment).items():
-        colour = COLOURS[styles[name] % len(COLOURS)] if name in styles else "#777777"
+        colour, dashes = (COLOURS[styles[name] % len(COLOURS)], "--") if name in styles else ("#777777", next(greys))
         x, y = curve.episode[curve.episode <= limit], curve.evaluation_return[curve.episode <= limit]
-        (line,) = panel.plot(x, y, color=colour, linewidth=1.1, linestyle="--")
+        (line,) = panel.plot(x, y, color=colour, linewidth=1.1, linestyle=dashes)
         handles[f"paper: {name}, 1 seed, ±300"] = line
     return handles
 

@@ -34,7 +34,7 @@ OF_EPISODES = {"n_step": 3, "observation_normalisation": "running"}
     ("environment", "environments", "changes"),
     [
         ("Pendulum-v1", 1, {}),
-        ("Fragile-v0", 3, OF_EPISODES),
+        pytest.param("Fragile-v0", 3, OF_EPISODES, marks=pytest.mark.slow),
         pytest.param("Fragile-v0", 3, {}, marks=pytest.mark.slow),
         pytest.param("Pendulum-v1", 3, OF_EPISODES, marks=pytest.mark.slow),
     ],
@@ -115,6 +115,7 @@ def test_the_random_steps_are_those_of_the_run_alone():
                 assert ours.run.sampling.bit_generator.state == theirs.run.sampling.bit_generator.state
 
 
+@pytest.mark.slow
 def test_what_the_other_runs_are_changes_no_bit(tmp_path):
     """The number of slots does decide the last bits; neighbours, places, processes and early ends do not."""
     configs = mixed()
@@ -143,7 +144,10 @@ def make(own, how, broken_at=100):
 
 @pytest.mark.parametrize(
     ("how", "words"),
-    [("nan", "reward nan"), ("raise", "Fragile-v0 raised an error in step: RuntimeError: the wheels came off")],
+    [
+        pytest.param("nan", "reward nan", marks=pytest.mark.slow),
+        ("raise", "Fragile-v0 raised an error in step: RuntimeError: the wheels came off"),
+    ],
 )
 def test_a_run_that_breaks_leaves_the_others_untouched(tmp_path, monkeypatch, how, words):
     with tiny_environments(monkeypatch) as prefix:

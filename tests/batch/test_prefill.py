@@ -28,7 +28,8 @@ def source(tmp_path, monkeypatch):
     return {"minari": "minari:pendulum/random-v0", "policy": f"policy:{folder / 'run'}"}
 
 
-@pytest.mark.parametrize("kind", ["minari", pytest.param("policy", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["minari", "policy"])
 def test_a_prefilled_group_is_that_of_runs_alone_and_goes_on(source, tmp_path, kind):
     configs = mixed(prefill=source[kind], update_interval=7, parallel_environments=2, replay_capacity=400)
     train(tmp_path / "straight", configs)

@@ -21,8 +21,9 @@ from saclab.training.run_folder import is_finished, read_run
 from .helpers import at_step, config, folders, mixed, stop_at, train
 
 
-@pytest.mark.parametrize("environment", ["Pendulum-v1", pytest.param("Hopper-v4", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("stop", [50, pytest.param(149, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", ["Pendulum-v1", "Hopper-v4"])
+@pytest.mark.parametrize("stop", [50, 149])
 def test_a_stopped_group_goes_on_bit_for_bit(tmp_path, environment, stop):
     """The stop comes in the random steps or after, a window of metrics, a round of updates and an episode under way."""
     configs = mixed(environment=environment, snapshots=2)
@@ -75,6 +76,7 @@ def test_saving_changes_nothing(tmp_path):
     assert_same_run(tmp_path / "straight/run-2", tmp_path / "saved/run-2")
 
 
+@pytest.mark.slow
 def test_a_stop_in_the_middle_of_an_evaluation_leaves_it_to_be_made(tmp_path):
     configs = mixed()
     train(tmp_path / "straight", configs)
@@ -95,6 +97,7 @@ def test_a_stop_in_the_middle_of_an_evaluation_leaves_it_to_be_made(tmp_path):
     assert_same_run(tmp_path / "straight/run-1", tmp_path / "stopped/run-1")
 
 
+@pytest.mark.slow
 def test_a_crash_while_saving_goes_back_to_the_step_that_all_have(tmp_path):
     """Some runs have the newest checkpoint then, the others only the one before."""
     configs = mixed()

@@ -81,12 +81,8 @@ def tree(tmp_path):
     return tmp_path
 
 
-HEADINGS = list(sections())
-
-
-@pytest.mark.parametrize(
-    "heading", [HEADINGS[0], *(pytest.param(heading, marks=pytest.mark.slow) for heading in HEADINGS[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("heading", list(sections()))
 def test_the_steps_of_a_section_work(tree, heading):
     blocks = sections()[heading]
     for block in blocks:

@@ -138,23 +138,20 @@ def test_a_row_set_back_to_the_protocol_is_no_plain_run(tmp_path, monkeypatch):
     assert len(read_comparison(both).arms) == 2, "what all have been given leaves the row its own"
 
 
-@pytest.fixture(scope="module")
-def seven(tmp_path_factory):
+@pytest.fixture
+def seven(tmp_path):
     """Seven arms with five seeds each, two of them under names of their own, on the path of the averaging study."""
-    root = tmp_path_factory.mktemp("seven")
-    runs = [
-        write_run(root, variant, seed, name=name, overrides=overrides, evaluations=50, q_bias=True,
+    return [
+        write_run(tmp_path, variant, seed, name=name, overrides=overrides, evaluations=50, q_bias=True,
                   level=8000 + 150 * index + 40 * seed)
         for index, (name, (variant, overrides)) in enumerate(SEVEN.items()) for seed in range(5)
     ]  # fmt: skip
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures, "DOTS_PER_INCH", 40)
-        return runs, write_report(runs, root / "out").parent
 
 
 @pytest.mark.slow
-def test_the_report_of_seven_arms_is_small_and_names_them(seven):
-    _, out = seven
+def test_the_report_of_seven_arms_is_small_and_names_them(seven, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "DOTS_PER_INCH", 40)
+    out = write_report(seven, tmp_path / "out").parent
     page = (out / "index.html").read_text()
     assert len(page) < 3e6
     for text in (page, (out / "report.md").read_text().replace("\\_", "_")):
@@ -168,7 +165,7 @@ def test_the_report_of_seven_arms_is_small_and_names_them(seven):
 
 
 def test_many_arms_are_ranked_and_each_winner_takes_one_sentence(seven):
-    entry = score_environment(read_comparison(seven[0]), "HalfCheetah-v4")
+    entry = score_environment(read_comparison(seven), "HalfCheetah-v4")
     assert len(entry.pairs) == 21
     *verdicts, undecided, levels = environment_sentences(entry)
     count = sum(not pair.improvement.decided for pair in entry.pairs)

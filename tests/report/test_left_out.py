@@ -6,13 +6,12 @@ import csv
 import json
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from saclab.api import compared
+from saclab.cli.main import main
 from saclab.errors import UserError
 from saclab.grid.plan import Cell
 from saclab.grid.tasks import make_statuses
@@ -80,19 +79,19 @@ def test_strict_refuses_and_names_the_first(folders, tmp_path):
     assert not (tmp_path / "report").exists()
 
 
-def test_the_command_lists_what_is_left_out_and_strict_exits_with_2(folders, tmp_path):
-    def report(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "saclab", "report", str(folders / "bert"), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=600)
+def test_the_command_lists_what_is_left_out_and_strict_exits_with_2(folders, tmp_path, capsys):
+    def report(*arguments: str) -> tuple[int, str, str]:
+        status = main(["report", str(folders / "bert"), *arguments])
+        return status, *capsys.readouterr()
 
-    told = report(str(folders / "HalfCheetah-v4"), "--out", str(tmp_path / "report"))
-    assert told.returncode == 0, told.stderr
-    assert told.stdout.count("left out: ") == 4
-    refused = report(str(folders / "HalfCheetah-v4"), "--out", str(tmp_path / "report"), "--strict")
-    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert "4 of 6 folders cannot be read" in refused.stderr
-    nothing = report()
-    assert (nothing.returncode, nothing.stderr.count("\n")) == (2, 1)
+    status, told, errors = report(str(folders / "HalfCheetah-v4"), "--out", str(tmp_path / "report"))
+    assert status == 0, errors
+    assert told.count("left out: ") == 4
+    status, _, errors = report(str(folders / "HalfCheetah-v4"), "--out", str(tmp_path / "report"), "--strict")
+    assert (status, errors.count("\n")) == (2, 1)
+    assert "4 of 6 folders cannot be read" in errors
+    status, _, errors = report()
+    assert (status, errors.count("\n")) == (2, 1)
 
 
 def test_runs_that_do_not_compare_are_still_refused(folders, tmp_path):

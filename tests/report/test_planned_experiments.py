@@ -26,7 +26,8 @@ def test_the_runs_are_small_and_all_finished(experiment):
     assert sum(path.stat().st_size for path in runs.rglob("*") if path.is_file()) < 10e6
 
 
-def test_the_page_of_averaging_comes_again_from_its_runs(tmp_path):
+def test_the_page_of_averaging_comes_again_from_its_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr("saclab.report.report.write_figures", lambda *_: None)  # their making is tested elsewhere
     page = write_report(find_runs([EXAMPLES / "averaging" / "runs"]), tmp_path)
     assert page.stat().st_size < 3e6
     assert "averaged-spacing-200" in page.read_text()

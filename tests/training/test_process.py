@@ -41,6 +41,7 @@ def entries(cache: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in cache.glob("saclab/xla/*/*-cache")}
 
 
+@pytest.mark.slow
 def test_what_is_compiled_is_kept_and_gives_the_same_bits(tmp_path):
     fresh, _ = trained(tmp_path / "without", tmp_path / "no", JAX_ENABLE_COMPILATION_CACHE="false")
     assert not entries(tmp_path / "no")

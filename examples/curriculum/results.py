@@ -83,6 +83,8 @@ def print_pairs(runs: Runs, environment: str) -> None:
 
 def compared(x: np.ndarray, y: np.ndarray, places: int) -> str:
     """The cells of a pair: f64[R] against f64[S]."""
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return "not measured | | "
     difference, chance = difference_of_means(x, y), probability_of_improvement([x], [y])
     effect = difference.exists and not difference.low <= 0 <= difference.high and chance.exists and chance.decided
     interval = f"{difference.estimate:+.{places}f} [{difference.low:+.{places}f}, {difference.high:+.{places}f}]"

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import csv
+import runpy
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from saclab.training.logs import reward_term_columns
@@ -44,11 +47,25 @@ def test_areas_finals_and_pairs_by_hand(tmp_path):
             write_arm(tmp_path, "Humanoid-v4", name, seed, values)
     table = printed(tmp_path)
     area = 1000 + 1000 * 1.5 / 19  # of nineteen equal spans, one rises and one stays above
-    assert f"| `sac-auto` | 0 | {area:.0f} | 2000 | 1000 | 1000 | {area:.0f} | 2000 | 1.08 | 2.00 |" in table
+    assert (
+        f"| `sac-auto` | 0 | {area:.0f} | 2000 | 1000 | 1000 | {area:.0f} | 2000 | 1.08 | 2.00 | 1000 | nan |" in table
+    )
     (final,) = [line for line in table.splitlines() if line.startswith("| H2, H3") and "| return, final |" in line]
     assert "| +1000 [+998, +1002] | 1.00 [0.58, 1.00] | yes |" in final
     assert "| episode length, area | +0 [+0, +0] | 0.50 [" in table
+    assert "| `curriculum` − `sac-auto` | Q bias | not measured | |  |" in table
     assert "H1" not in table
+
+
+def test_the_bias_of_the_second_half_and_the_length_in_the_first_tenth_by_hand():
+    """Of a run of ten updates with two evaluations in its first tenth, after 10 and 40 steps."""
+    results = SimpleNamespace(**runpy.run_path(str(RESULTS)))
+    evaluations = {"updates": np.array([1, 1, 6, 10]), "steps": np.array([10, 40, 50, 60])}
+    q_bias = {"updates": np.array([5, 6, 10]), "mean_bias": np.array([9.0, 1.0, np.nan])}
+    run = SimpleNamespace(evaluations=evaluations, q_bias=q_bias)
+    assert results.late_bias(run) == 1.0
+    first = results.by_steps(run, np.array([20.0, 60.0, 500.0, 500.0]), results.shares(run) <= results.FIRST)
+    assert first == (20 * 10 + 60 * 30) / 40
 
 
 @pytest.mark.parametrize(("late", "verdict"), [(-20.0, "holds"), (-60.0, "does not hold")])

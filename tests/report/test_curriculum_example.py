@@ -57,7 +57,7 @@ def test_areas_finals_and_pairs_by_hand(tmp_path):
     assert "H1" not in table
 
 
-def test_the_bias_of_the_second_half_and_the_length_in_the_first_tenth_by_hand():
+def test_the_late_bias_and_the_first_tenth_by_hand():
     """Of a run of ten updates with two evaluations in its first tenth, after 10 and 40 steps."""
     results = SimpleNamespace(**runpy.run_path(str(RESULTS)))
     evaluations = {"updates": np.array([1, 1, 6, 10]), "steps": np.array([10, 40, 50, 60])}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,20 @@ settings = dict(hidden_layers=(16,), batch_size=8, random_steps=8, max_steps=40,
                 evaluation_episodes=1)
 for event in train(make_config("Pendulum-v1", "averaged-auto", overrides=settings), Path(sys.argv[1])):
     pass
+"""
+
+
+WORK_AGAIN = """
+import resource
+import numpy as np
+from saclab.training.process import prepare_process
+prepare_process()
+for _ in range(2):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    work = np.empty(300 * 2**20, np.uint8)
+    work.fill(1)
+    del work
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
@@ -61,6 +76,14 @@ def test_a_damaged_entry_is_compiled_again(tmp_path):
         path.write_bytes(path.read_bytes()[:1000])
     second, _ = trained(tmp_path / "second", tmp_path)
     assert first == second
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="malloc is told so where it is glibc's")
+def test_what_16_averaged_runs_work_in_is_kept_when_it_is_free():
+    done = subprocess.run([sys.executable, "-c", WORK_AGAIN], capture_output=True, text=True, check=True)
+    first, again = map(int, done.stdout.split())
+    assert first > 300 * 2**20 // 2**21, "all of it was new"
+    assert again < 10, "page faults"
 
 
 def test_another_number_of_threads_has_a_folder_of_its_own(monkeypatch):

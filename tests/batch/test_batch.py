@@ -77,6 +77,7 @@ def actions_alone(own):
         return replay.layout.unpack(replay.rows[own.training.random_steps : replay.added]).action
 
 
+@pytest.mark.slow
 def test_the_behaviour_parameters_are_as_far_behind_as_they_are_alone():
     """With a learning rate at which each update shows in the actions."""
     fast = {"actor_learning_rate": 0.03, "critic_learning_rate": 0.03, "replay_capacity": 1000}

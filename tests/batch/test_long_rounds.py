@@ -93,7 +93,7 @@ def test_a_stop_between_two_parts_goes_on_bit_for_bit(tmp_path, delay):
         assert_same_run(tmp_path / f"straight/run-{index}", tmp_path / f"stopped/run-{index}")
 
 
-@pytest.mark.parametrize("delay", [0, 1])
+@pytest.mark.parametrize("delay", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_rounds_in_parts_are_those_of_the_run_alone(delay):
     """Actions and networks, with a learning rate at which each update shows; the rows that are drawn to the bit."""
     own = config(acting_delay=delay, actor_learning_rate=0.03, critic_learning_rate=0.03, **LONG)

@@ -132,6 +132,7 @@ def test_a_run_at_its_score_is_worth_the_way_there(tmp_path):
     assert "with all of its runs at the score yet" in never.page.read_text()
 
 
+@pytest.mark.slow
 def test_a_tune_without_the_variants_own_settings_goes_on_too(tmp_path):
     space = {"defaults": False, "batch_size": [16, 32]}
     first = tune(tmp_path, 1, space=space)

@@ -19,7 +19,7 @@ from saclab.files import absolute
 from saclab.machine import COMPILER_OPTIONS, accelerator_plugins, processor_features, visible_threads
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
-KEPT_BYTES = 2**30  # what 16 averaged runs work in is 2**28 or more; the largest replay buffers still go back to the system
+KEPT_BYTES = 2**30  # a group of 16 averaged runs works in more than 2**28; the largest replay buffers still go back
 WORTH_KEEPING_SECONDS = 0.1
 
 

@@ -162,6 +162,7 @@ def test_settings_follow_the_environment_wherever_it_stands_on_the_line(tmp_path
     assert config["training"]["patience_episodes"] == 750
 
 
+@pytest.mark.slow
 def test_train_stops_on_ctrl_c_and_resume_ends_as_if_nothing_had_happened(tmp_path: Path) -> None:
     arguments = ["Pendulum-v1", "--protocol", "quick", *SHORT, "--max-updates", "3000"]
     straight = saclab("train", *arguments, "--runs", "straight", folder=tmp_path)

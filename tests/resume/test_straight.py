@@ -52,6 +52,7 @@ def test_every_variant_continues_exactly(environment, variant, environments, tmp
     assert_exact(small_config(environment, variant, environments), tmp_path)
 
 
+@pytest.mark.slow
 def test_every_axis_at_once_continues_exactly(tmp_path):
     assert_exact(small_config("HalfCheetah-v4", environments=3, critic_hidden_layers=(8,), **TOGETHER), tmp_path)
 

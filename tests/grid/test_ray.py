@@ -206,7 +206,9 @@ def test_the_command_saves_on_a_signal_and_says_nothing_of_rays(tmp_path, straig
     process.send_signal(number)
     output, _ = process.communicate(timeout=600)
     assert process.returncode == 128 + number, output
-    assert output.count("interrupted") == 2
+    unfinished = [cell for cell in grid(tmp_path / "runs") if not cell.finished]  # one may have been much the faster
+    assert unfinished
+    assert output.count("interrupted") == len(unfinished), output
     assert output.splitlines()[-1] == "saved; the same command continues where it stopped"
     assert "ray" not in output.lower()
     assert all(map(is_dead, workers))

@@ -17,6 +17,7 @@ saclab's evaluations counted in.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import os
 import subprocess
@@ -40,13 +41,16 @@ SACLAB = {
     "saclab, acting_delay 1": (("acting_delay", 1),),
     "saclab, averaged": (("variant", "averaged"),),
 }
+# Name -> script, and the word that tells it which package it races.
 PEERS = {
     "Stable-Baselines3": ("stable_baselines3_run.py", "stable-baselines3"),
     "SBX": ("stable_baselines3_run.py", "sbx-rl"),
     "Tianshou": ("tianshou_run.py", "tianshou"),
-    "RLtools": ("rltools_run.py", "rltools"),
+    "RLtools, MKL": ("rltools_run.py", "mkl"),
+    "RLtools, OpenBLAS": ("rltools_run.py", "openblas"),
     "TorchRL": ("torchrl_run.py", "torchrl"),
 }
+RLTOOLS = ("RLtools, MKL", "RLtools, OpenBLAS")
 
 
 @dataclass(frozen=True)
@@ -60,10 +64,10 @@ class Place:
 
 PLACES = {
     "single run": Place(lambda cores: [cores], (*SACLAB, *PEERS)),
-    "one core": Place(lambda cores: [cores[:1]], ("saclab", "Stable-Baselines3", "SBX", "RLtools")),
+    "one core": Place(lambda cores: [cores[:1]], ("saclab", "Stable-Baselines3", "SBX", *RLTOOLS)),
     "grid": Place(
         lambda cores: [[core] for core in cores],
-        ("saclab", "saclab, averaged", "Stable-Baselines3", "SBX", "RLtools"),
+        ("saclab", "saclab, averaged", "Stable-Baselines3", "SBX", *RLTOOLS),
     ),
 }
 
@@ -107,6 +111,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=HERE / "results" / "speed.json")
     options = parser.parse_args()
     cases = [case for case in CASES if options.only in case.name]
+    if not links_openblas():
+        print("RLtools races with MKL only: there is no OpenBLAS to link (Debian: libopenblas-dev)", flush=True)
     record: dict[str, Any] = {**facts(), "cases": {}}
     for turn in range(options.rounds):
         for case in cases:
@@ -117,11 +123,21 @@ def main() -> None:
             print(f"round {turn + 1}/{options.rounds}  {case.name}: {told}", flush=True)
 
 
+def links_openblas() -> bool:
+    """Whether a program that asks for `-lblas`, as RLtools does, gets OpenBLAS."""
+    try:
+        return hasattr(ctypes.CDLL("libblas.so"), "openblas_get_config")
+    except OSError:
+        return False
+
+
 def race(case: Case, peers: Path) -> dict[str, dict[str, Any]]:
     """One round: contestant -> its result; the entry `limit` is the machine's."""
     processes = in_processes(case, lambda _: [sys.executable, str(HERE / "machine_limit.py"), case.environment])
     results = {}
     for name in PLACES[case.place].contestants:
+        if name == "RLtools, OpenBLAS" and not links_openblas():
+            continue
         if name in SACLAB:
             results[name] = run(case, [sys.executable, str(HERE / "contestants" / "saclab_run.py")], SACLAB[name])
         else:

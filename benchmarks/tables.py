@@ -17,8 +17,8 @@ from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
 BASE = "saclab"
-PEER_ROWS = ("Stable-Baselines3", "SBX", "Tianshou", "RLtools", "TorchRL")
-PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "rltools", "mkl", "torchrl", "tensordict", "torch")
+PEER_ROWS = ("Stable-Baselines3", "SBX", "Tianshou", "RLtools, MKL", "RLtools, OpenBLAS", "TorchRL")
+PEERS = ("stable-baselines3", "sbx-rl", "tianshou", "rltools", "mkl", "openblas", "torchrl", "tensordict", "torch")
 
 
 def speed_table(record: dict[str, Any]) -> str:

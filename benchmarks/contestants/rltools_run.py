@@ -1,15 +1,16 @@
-"""RLtools, compiled for the job with MKL: its own loop, and evaluations by its compiled policy.
+"""RLtools, compiled for the job with MKL or the system's OpenBLAS: its own loop, evaluations by its compiled policy.
 
-It writes no logs and no policy's file here, which is in its favour. RL_TOOLS_DISABLE_MKL=1 has it use
-the BLAS of the system.
+It writes no logs and no policy's file here, which is in its favour.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from typing import Any
 
-os.environ.setdefault("RL_TOOLS_FORCE_MKL", "1")  # without MKL it is many times slower
+os.environ["RL_TOOLS_FORCE_MKL" if sys.argv[2] == "mkl" else "RL_TOOLS_DISABLE_MKL"] = "1"
 
 import gymnasium
 import rltools
@@ -17,6 +18,7 @@ from gymnasium.wrappers import RescaleAction
 from stopwatch import Job, Stopwatch
 
 gymnasium.logger.min_level = gymnasium.logger.ERROR
+BLAS = sys.argv[2]  # mkl or openblas; without either it is many times slower
 EPISODE_STEPS = 1000
 
 
@@ -33,7 +35,7 @@ def main() -> None:
     cores = "_".join(map(str, sorted(os.sched_getaffinity(0))))  # processes of a grid compile at the same time
     name = f"{job.environment.lower().replace('-', '_')}_{job.update_interval}_{cores}"
     compiled = rltools.SAC(
-        environment, interface_name=f"race_{name}", enable_evaluation=False, GAMMA=0.99,
+        environment, interface_name=f"race_{BLAS}_{name}", enable_evaluation=False, GAMMA=0.99,
         ACTOR_BATCH_SIZE=256, CRITIC_BATCH_SIZE=256, CRITIC_TRAINING_INTERVAL=job.update_interval,
         ACTOR_TRAINING_INTERVAL=job.update_interval, CRITIC_TARGET_UPDATE_INTERVAL=job.update_interval,
         N_WARMUP_STEPS=job.random_steps, STEP_LIMIT=10_000_000, REPLAY_BUFFER_CAP=job.replay_capacity,
@@ -47,7 +49,18 @@ def main() -> None:
         stopwatch.updates_made(max(0, step - job.random_steps) // job.update_interval)
         if step % job.evaluation_interval_steps == 0:
             evaluate(state, evaluated)
-    stopwatch.report("rltools", "mkl")
+    if BLAS == "mkl":
+        stopwatch.report("rltools", "mkl")
+    else:
+        stopwatch.report("rltools", libraries={"openblas": openblas_version()})
+
+
+def openblas_version() -> str:
+    """Its number, and the processor that it takes this one for."""
+    config = ctypes.CDLL("libblas.so").openblas_get_config
+    config.restype = ctypes.c_char_p
+    _, number, *_, processor, _ = config().decode().split()
+    return f"{number} {processor}"
 
 
 def evaluate(state: Any, environments: list[Any]) -> float:

@@ -7,8 +7,10 @@ import os
 import resource
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from types import MappingProxyType
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,14 @@ class Stopwatch:
         if updates >= self.job.warm_updates + self.job.timed_updates and self.end is None:
             self.end = now
 
-    def report(self, *packages: str, **more: float) -> None:
-        """One line of JSON on standard output."""
+    def report(self, *packages: str, libraries: Mapping[str, str] = MappingProxyType({}), **more: float) -> None:
+        """One line of JSON on standard output.
+
+        Args:
+            packages: whose versions are told.
+            libraries: versions of what is no Python package.
+            more: what else was measured.
+        """
         assert self.start is not None
         assert self.end is not None
         seconds, cpu_seconds, updates = (end - start for start, end in zip(self.start, self.end, strict=True))
@@ -78,6 +86,6 @@ class Stopwatch:
             * (1 if sys.platform == "darwin" else 1024),
             "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
             **more,
-            "versions": {name: version(name) for name in (*packages, "gymnasium", "mujoco", "numpy")},
+            "versions": {name: version(name) for name in (*packages, "gymnasium", "mujoco", "numpy")} | dict(libraries),
         }
         print(json.dumps(result), flush=True)

@@ -4,16 +4,21 @@
     python benchmarks/least.py HalfCheetah-v4                                                  on all of them
 
 Everything is done many times in a row on arrays of the update's shapes. What the update takes beyond the sum is the way
-of its operands between cache and memory, and whatever is not among the kinds below.
+of its operands between cache and memory, and whatever is not among the kinds below. The same products by NumPy's BLAS
+stand beside it.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import statistics
+import time
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from breakdown import alternating, update_breakdown
 from keep import keep
@@ -21,7 +26,6 @@ from operations import MatrixProduct, matrix_products
 
 from saclab.machine import usable_cores
 from saclab.protocols import make_config
-from saclab.replay import RowLayout
 from saclab.settings import AlgorithmSettings
 from saclab.training.local_engine import LocalEngine
 from saclab.training.process import prepare_process
@@ -42,11 +46,28 @@ def warm(work: Callable[..., jax.Array], first: jax.Array, *others: jax.Array) -
     return alternating(timed, ROUNDS, ROUNDS)["work"] / REPEATS
 
 
-def products(algorithm: AlgorithmSettings, layout: RowLayout) -> float:
-    def one(product: MatrixProduct) -> float:
-        return warm(product.multiply, *(jnp.ones(shape) for shape in product.shapes))
+def by_xla(product: MatrixProduct) -> float:
+    return warm(product.multiply, *(jnp.ones(shape) for shape in product.shapes))
 
-    return sum(map(one, matrix_products(algorithm, layout)))
+
+def by_blas(product: MatrixProduct) -> float:
+    """Milliseconds of a product by NumPy's BLAS."""
+    ((left_axis,), (right_axis,)), _ = product.multiply.keywords["dimension_numbers"]
+    left, right = (np.ones(shape, np.float32) for shape in product.shapes)
+    size = left.shape[left_axis]  # the others are one axis, or the snapshots of plain SAC, of which there is one
+    left, right = (
+        np.moveaxis(left, left_axis, -1).reshape(-1, size),
+        np.moveaxis(right, right_axis, 0).reshape(size, -1),
+    )
+    result = np.empty((len(left), right.shape[1]), np.float32)
+    assert result.size == math.prod(jax.eval_shape(product.multiply, *map(jnp.ones, product.shapes)).shape)
+    seconds = []
+    for _ in range(ROUNDS):
+        began = time.perf_counter()
+        for _ in range(REPEATS):
+            np.matmul(left, right, out=result)
+        seconds.append(time.perf_counter() - began)
+    return 1000 * statistics.median(seconds) / REPEATS
 
 
 def activations(algorithm: AlgorithmSettings) -> float:
@@ -92,22 +113,25 @@ def main() -> None:
     engine = LocalEngine.new(config)
     algorithm, layout = config.algorithm, engine.replay.layout
     policy, critics = engine.learner_state.actor.weights, engine.learner_state.critic.weights
+    products = matrix_products(algorithm, layout)
     parts = {
-        "matrix products": products(algorithm, layout),
+        "matrix products": sum(map(by_xla, products)),
         "activations, masks, gradients of biases": activations(algorithm),
         "Adam, policy and critics": adam(policy) + adam(critics.ravel()),
         "Polyak averaging": warm(lambda targets: targets + 0.005 * (critics - targets), critics + 1),
         "random numbers": noise(algorithm.batch_size, layout.action_size),
     }
     engine.close()
+    blas = sum(map(by_blas, products))
     update = update_breakdown(options.environment, "sac", 400)
     parts["calling XLA"] = update["calling XLA"]
     parts["the way to memory, and all else"] = update["whole"] - sum(parts.values())
     for part, milliseconds in parts.items():
         print(f"  {part:<42}{milliseconds:8.2f} ms {milliseconds / update['whole']:6.0%}")
     print(f"  {'an update':<42}{update['whole']:8.2f} ms")
+    print(f"  {'matrix products by NumPy BLAS':<42}{blas:8.2f} ms")
     name = f"least-{options.environment}-{len(usable_cores())}-core"
-    keep(name, milliseconds=parts, update_milliseconds=update["whole"])
+    keep(name, milliseconds=parts, update_milliseconds=update["whole"], blas_milliseconds=blas)
 
 
 if __name__ == "__main__":

@@ -99,20 +99,20 @@ VARIANTS: dict[str, Variant] = {
         "The temperature is learned so that the policy keeps a target entropy (Eq. 8).",
         LEARNED,
         paper_name="sac-alpha-tuning",
-        cost=0.95,
+        cost=0.97,
     ),
     "averaged": Variant(
         "Averaged-SAC",
         "The next state's value is the mean over the last K target networks (Eq. 9).",
         AVERAGED,
         paper_name="averaged-sac",
-        cost=1.95,
+        cost=2.06,
     ),
     "averaged-auto": Variant(
         "Averaged-SAC, learned α",
         "Averaged targets (Eq. 9) and a learned temperature (Eq. 8): the paper's first future experiment.",
         AVERAGED | LEARNED,
-        cost=2.04,
+        cost=2.05,
     ),
     "averaged-entropy": Variant(
         "Averaged entropy term (not Eq. 9)",
@@ -142,7 +142,7 @@ VARIANTS: dict[str, Variant] = {
         ENSEMBLE | {"critics": 10, "target_critics": 2},
         {prefix: {"target_entropy": entropy} for prefix, entropy in ENSEMBLE_ENTROPY.items()},
         source="Chen et al. 2021",
-        cost=37.9,
+        cost=42.6,
     ),
     "droq": Variant(
         "DroQ",
@@ -153,7 +153,7 @@ VARIANTS: dict[str, Variant] = {
             for prefix, entropy in ENSEMBLE_ENTROPY.items()
         },
         source="Hiraoka et al. 2022",
-        cost=20.6,
+        cost=19.9,
     ),
     "tqc": Variant(
         "TQC",
@@ -171,7 +171,7 @@ VARIANTS: dict[str, Variant] = {
         },
         {"HalfCheetah-": {"dropped_quantiles": 0}, "Hopper-": {"dropped_quantiles": 5}},
         source="Kuznetsov et al. 2020",
-        cost=12.5,
+        cost=15.2,
     ),
     "crossq": Variant(
         "CrossQ",
@@ -194,7 +194,7 @@ VARIANTS: dict[str, Variant] = {
         },
         {"Swimmer-": {"discount": 0.9999}},
         source="Bhatt et al. 2024",
-        cost=45.8,
+        cost=53.9,
     ),
     "xqc": Variant(
         "XQC",
@@ -217,7 +217,7 @@ VARIANTS: dict[str, Variant] = {
             "target_entropy_per_action": -0.5,
         },
         source="Palenicek et al. 2025",
-        cost=18.9,
+        cost=23.1,
     ),
     "simbav2": Variant(
         "SimbaV2",
@@ -244,7 +244,7 @@ VARIANTS: dict[str, Variant] = {
             "target_entropy_per_action": -0.5,
         },
         source="Lee et al. 2025",
-        cost=78.5,
+        cost=93.3,
     ),
     "flashsac": Variant(
         "FlashSAC",
@@ -272,7 +272,7 @@ VARIANTS: dict[str, Variant] = {
             "target_entropy_per_action": -0.4781814,
         },
         source="Kim et al. 2026",
-        cost=26.8,
+        cost=31.6,
     ),
 }
 

@@ -41,7 +41,7 @@ SACLAB = {
     "saclab, acting_delay 1": (("acting_delay", 1),),
     "saclab, averaged": (("variant", "averaged"),),
 }
-# Name -> script, and the word that tells it which package it races.
+# Name -> script, and the word that tells it what to race with: a package, a BLAS.
 PEERS = {
     "Stable-Baselines3": ("stable_baselines3_run.py", "stable-baselines3"),
     "SBX": ("stable_baselines3_run.py", "sbx-rl"),

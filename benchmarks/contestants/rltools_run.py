@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from importlib.metadata import version
 from typing import Any
 
 os.environ["RL_TOOLS_FORCE_MKL" if sys.argv[2] == "mkl" else "RL_TOOLS_DISABLE_MKL"] = "1"
@@ -49,14 +50,13 @@ def main() -> None:
         stopwatch.updates_made(max(0, step - job.random_steps) // job.update_interval)
         if step % job.evaluation_interval_steps == 0:
             evaluate(state, evaluated)
+    stopwatch.report("rltools", libraries={BLAS: blas_version()})
+
+
+def blas_version() -> str:
+    """The number, and of OpenBLAS the processor that it takes this one for."""
     if BLAS == "mkl":
-        stopwatch.report("rltools", "mkl")
-    else:
-        stopwatch.report("rltools", libraries={"openblas": openblas_version()})
-
-
-def openblas_version() -> str:
-    """Its number, and the processor that it takes this one for."""
+        return version("mkl")
     config = ctypes.CDLL("libblas.so").openblas_get_config
     config.restype = ctypes.c_char_p
     _, number, *_, processor, _ = config().decode().split()

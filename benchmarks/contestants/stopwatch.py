@@ -10,7 +10,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from types import MappingProxyType
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Stopwatch:
         if updates >= self.job.warm_updates + self.job.timed_updates and self.end is None:
             self.end = now
 
-    def report(self, *packages: str, libraries: Mapping[str, str] = MappingProxyType({}), **more: float) -> None:
+    def report(self, *packages: str, libraries: Mapping[str, str] | None = None, **more: float) -> None:
         """One line of JSON on standard output.
 
         Args:
@@ -86,6 +85,7 @@ class Stopwatch:
             * (1 if sys.platform == "darwin" else 1024),
             "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
             **more,
-            "versions": {name: version(name) for name in (*packages, "gymnasium", "mujoco", "numpy")} | dict(libraries),
+            "versions": {name: version(name) for name in (*packages, "gymnasium", "mujoco", "numpy")}
+            | dict(libraries or {}),
         }
         print(json.dumps(result), flush=True)

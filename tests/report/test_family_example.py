@@ -8,7 +8,8 @@ from pathlib import Path
 
 from .synthetic import write_run
 
-RESULTS = Path(__file__).parents[2] / "examples" / "family" / "results.py"
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "examples" / "family" / "results.py"
 
 
 def test_ours_beside_the_published_returns(tmp_path):
@@ -27,3 +28,10 @@ def test_ours_beside_the_published_returns(tmp_path):
         "| `tqc` | 20,000 | 4321 | none |  |",
         "| `xqc` | 50,000 | 5000, 5310 | 6754 ± 1098, 10 seeds | -1.5 |",  # (5155.2 − 6753.7) / 1098.4
     ]
+
+
+def test_the_table_of_the_page_is_that_of_the_kept_runs():
+    table = subprocess.run([sys.executable, RESULTS], capture_output=True, text=True, check=True).stdout
+    page = (ROOT / "docs" / "variants" / "README.md").read_text()
+    assert page.partition("<!-- family -->\n")[2].partition("<!-- /family -->")[0] == table
+    assert table.count("\n") > 2, "there are runs"

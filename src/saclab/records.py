@@ -52,6 +52,12 @@ class Unreadable(Damaged):
     state = "cannot be read"
 
 
+class OfAnotherVersion(Damaged):
+    """A file in which another version of saclab has written what this one does not know."""
+
+    state = "does not fit this version of saclab"
+
+
 class Missing(Unreadable):
     """There is no such file."""
 

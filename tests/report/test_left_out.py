@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,29 @@ REASONS = {
     "seed-3": "metrics.jsonl is damaged (line 1: Expected `object`, got `array`)",
     "seed-4": "result.json is damaged (Expected `object`, got `array`)",
 }
+
+
+@pytest.mark.parametrize(
+    ("writer", "reason"),
+    [
+        (
+            version("saclab"),
+            r"config\.json is damaged \(unknown setting 'of_tomorrow'.*remove the folder and train again",
+        ),
+        (
+            "99.0",
+            r"config\.json does not fit this version of saclab \(.*'of_tomorrow'.*by saclab 99\.0, so read it with",
+        ),
+    ],
+)
+def test_a_setting_of_another_version_is_not_called_damage(tmp_path, writer: str, reason: str):
+    path = write_run(tmp_path, seed=0, evaluations=3) / "config.json"
+    description = json.loads(path.read_text())
+    description["config"]["training"]["of_tomorrow"] = 1
+    description["versions"]["saclab"] = writer
+    path.write_text(json.dumps(description))
+    with pytest.raises(UserError, match=reason):
+        read_config(path.parent)
 
 
 def test_one_bad_folder_does_not_stop_the_report(folders, tmp_path):

@@ -18,6 +18,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,7 @@ from saclab.records import (
     FileRecord,
     Formatted,
     Missing,
+    OfAnotherVersion,
     Prefilled,
     Result,
     RunDescription,
@@ -102,11 +104,14 @@ def read_description(run: Path, recorded: Mapping[str, FileRecord]) -> RunDescri
 
 
 def config_of(run: Path, description: RunDescription) -> Config:
-    """The configuration in config.json; raises Damaged if there is none that works."""
+    """The configuration in config.json; raises Damaged if there is none that works, or none that works here."""
     try:
         return Config.from_dict(description.config)
     except (msgspec.ValidationError, UserError) as error:
-        raise Damaged(run / "config.json", error) from error
+        path, writer = run / "config.json", description.versions.get("saclab")
+        if writer in (None, version("saclab")):
+            raise Damaged(path, error) from error
+        raise OfAnotherVersion(path, error, f"it was written by saclab {writer}, so read it with that") from error
 
 
 def append_line(path: Path, value: object) -> None:

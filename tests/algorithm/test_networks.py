@@ -18,7 +18,7 @@ from saclab.algorithm.networks.batch_norm_mlp import (
     normalise,
     renormalised_moments,
 )
-from saclab.algorithm.networks.layer_norm_mlp import dropped_out
+from saclab.algorithm.networks.layer_norm_mlp import draws, dropped_out
 from saclab.algorithm.networks.network import ACTIVATIONS, INITIALISATIONS, Design
 
 
@@ -182,6 +182,18 @@ def test_dropout_leaves_out_its_share_and_keeps_the_mean():
     assert set(np.unique(left)) == {0.0, 4.0}
     assert (left == 0).mean() == pytest.approx(0.25, abs=0.007)  # five standard deviations
     assert len(np.unique((left == 0).sum(axis=0))) > 10, "each unit is left out by itself"
+
+
+def test_dropout_draws_sixteen_even_bits_for_each_unit_by_itself():
+    drawn = np.asarray(draws(KEY, (333, 301)))
+    assert (drawn.shape, drawn.dtype) == ((333, 301), np.uint16)
+    counts = np.histogram(drawn, bins=256, range=(0, 2**16))[0]
+    expected = drawn.size / 256
+    assert ((counts - expected) ** 2 / expected).sum() == pytest.approx(255, abs=6 * np.sqrt(2 * 255))  # χ²
+    for apart in (1, 2, 3, 4, 301, drawn.size // 2):
+        related = np.corrcoef(drawn.ravel()[:-apart], drawn.ravel()[apart:])[0, 1]
+        assert abs(related) < 6 / np.sqrt(drawn.size - apart), apart
+    assert not np.array_equal(drawn, np.asarray(draws(jax.random.PRNGKey(9), (333, 301))))
 
 
 def test_dropout_acts_while_a_network_learns_only():

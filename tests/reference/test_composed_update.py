@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import ACTION_SIZE, MORE_CASES, OBSERVATION_SIZE, VARIANT_CASES, as_parameters, context, make_case
+from jax.extend.random import threefry_2x32
 
 from saclab.algorithm.types import Context
 
@@ -98,14 +99,20 @@ def draws(state, step: int, settings) -> Draws:
 
 def masks(key, settings) -> list[np.ndarray] | None:
     """What dropout multiplies the outputs of each hidden layer by: 0 for the rate's share of 16-bit numbers."""
-    rate, widths = settings.critic_dropout, settings.layers_of_critic
-    if rate == 0:
+    if settings.critic_dropout == 0:
         return None
-    drawn = [
-        np.asarray(jax.random.bits(layer_key, (settings.batch_size, width), "uint16"))
-        for layer_key, width in zip(jax.random.split(key, len(widths)), widths, strict=True)
+    keys = jax.random.split(key, len(settings.layers_of_critic))
+    return [
+        mask(layer_key, (settings.batch_size, width), settings.critic_dropout)
+        for layer_key, width in zip(keys, settings.layers_of_critic, strict=True)
     ]
-    return [(bits >= rate * 65536) / (1 - rate) for bits in drawn]
+
+
+def mask(key, shape: tuple[int, int], rate: float) -> np.ndarray:
+    blocks = -(-shape[0] * shape[1] // 4)
+    words = np.asarray(threefry_2x32(key, np.arange(2 * blocks, dtype=np.uint32)))
+    draws = np.column_stack([words & 0xFFFF, words >> 16]).ravel()[: shape[0] * shape[1]]
+    return (draws >= rate * 65536).reshape(shape) / (1 - rate)
 
 
 def expected_ring(reference: NumpySac) -> np.ndarray:

@@ -9,7 +9,7 @@ compiled before) are counted in. One core each, as many side by side as there ar
 turn. What is kept already is not run again, so the measurement can be stopped and go on; `--only` chooses
 contestants. A run that never gets there ends after 200,000 steps, after 1,000,000 where an update follows every fifth
 step ("1:5"), so all make as many updates: by the costs of docs/variants/README.md some twenty minutes of sac-auto on a
-core, four to six hours of tqc, xqc and droq.
+core, three to six hours of tqc, xqc and droq.
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ PROTOCOLS: dict[str, Protocol] = {
     ),
     "fast": Protocol(
         "A good policy in little time on a CPU: standard with batches of 64, learning rates of 2e-3, half the random "
-        "steps and a fifth of the others. Tuned for sac-auto on HalfCheetah-v4; what it reaches in the end was not "
-        "compared, and a variant with batches or learning rates of its own keeps them.",
+        "steps and a fifth of the others. Tuned for sac-auto on HalfCheetah-v4, not fit for Humanoid-v4; what it reaches "
+        "in the end was not compared, and a variant with batches or learning rates of its own keeps them.",
         TrainingSettings(
             random_steps=5_000,
             update_interval=1,

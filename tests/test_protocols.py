@@ -54,6 +54,15 @@ def test_redq_droq_and_tqc_follow_their_authors_by_environment(environment, entr
     assert variant_settings("tqc", environment).dropped_quantiles == dropped
 
 
+def test_fast_on_humanoid_is_standard_with_an_update_every_fifth_step():
+    """What `benchmarks/time_to_score.py` measured there as "1:5"; where evaluations are made is no part of it."""
+    often = {"evaluation_interval_steps": 5000, "evaluation_episodes": 5}
+    fast = make_config("Humanoid-v4", "sac-auto", "fast", overrides=often)
+    standard = make_config("Humanoid-v4", "sac-auto", "standard", overrides={"update_interval": 5, **often})
+    assert dataclasses.replace(fast, protocol="standard") == standard
+    assert make_config("HumanoidStandup-v4", "sac-auto", "fast").training.update_interval == 1
+
+
 def test_a_quick_run_of_a_dear_variant_is_held_to_what_takes_minutes(row):
     dear = {"batch_size": 512, "critic_hidden_layers": (2048, 128), "actor_interval": 2, "updates_per_interval": 20}
     row(**dear)

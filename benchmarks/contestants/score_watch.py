@@ -22,7 +22,7 @@ class ScoreJob:
     """The contestant may write here."""
     began: float
     """`time.time()` when the process was started."""
-    settings: dict[str, str | int] = field(default_factory=dict)
+    settings: dict[str, str | int | float] = field(default_factory=dict)
     """Variant, protocol and settings of saclab's."""
 
     def to_json(self) -> str:

@@ -235,6 +235,12 @@ def variants_table(variants: Mapping[str, Variant]) -> Table:
 
 
 def settings_of(protocol: Protocol) -> dict[str, Any]:
-    """What a protocol sets, by name, and what it holds a variant to."""
+    """What a protocol sets, by name, what it holds a variant to, and what differs by environment."""
     of_training = {name: value for name, value in dataclasses.asdict(protocol.settings).items() if value is not None}
-    return of_training | protocol.algorithm | {f"{name} at most": most for name, most in protocol.ceilings.items()}
+    held = {f"{name} at most": most for name, most in protocol.ceilings.items()}
+    elsewhere = {
+        f"on {prefix}* {name}": value
+        for prefix, here in protocol.by_environment.items()
+        for name, value in here.items()
+    }
+    return of_training | protocol.algorithm | held | elsewhere

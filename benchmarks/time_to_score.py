@@ -99,7 +99,7 @@ class Race(NamedTuple):
 
 
 def steps_per_update(environment: str, settings: dict[str, Any]) -> int:
-    """Of a contestant of saclab's; one for the peer, that has no settings here."""
+    """Environment steps before each update of a contestant; one for the peer, whose default it is."""
     if not settings:
         return 1
     own = dict(settings)
